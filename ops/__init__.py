@@ -1,0 +1,1 @@
+"""Stateless tensor functions: splat, integrate, composite. They know tensors and nothing of lenses."""

@@ -1,0 +1,121 @@
+"""Flat convex point-spread functions, row by row.
+
+A flat PSF is a convex shape, scaled by the circle of confusion and filled evenly. Each image row cuts a slab
+of height one out of it. The slab is replaced by a rectangle of the same area: from the mean left edge to the
+mean right edge over the covered part of the row, weighted by the share of the row that is covered. So the mass
+is exact for every radius, rows enter and leave with weight zero, and the ends move continuously with the CoC.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+MIN_RADIUS = 0.5
+"""Below this radius (px) a PSF lies within its own pixel: the splat is the identity."""
+
+
+class Profile(NamedTuple):
+    """A convex unit shape: ``left(y) <= x <= right(y)`` for ``y`` between the first and the last knot.
+
+    The edges run linearly from knot to knot; a semi-ellipse of half-width ``bulge`` over the whole height is
+    taken off the left and added to the right edge. A polygon has ``bulge`` 0, an ellipse has two knots. The
+    shape is scaled by the signed CoC, so a foreground PSF (negative CoC) is point-mirrored, as in a camera.
+
+    Attributes:
+        knots: ``(K, 3)`` rows ``(y, left, right)``, ascending in y, K >= 2, in units of the CoC radius.
+        bulge: scalar tensor >= 0, in units of the CoC radius.
+    """
+
+    knots: Tensor
+    bulge: Tensor
+
+
+def working_dtype(device: torch.device) -> torch.dtype:
+    """The dtype of geometry and running sums: double, where the device has it."""
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
+class _Semicircle(torch.autograd.Function):
+    """``∫_0^t sqrt(1 - u²) du`` for |t| <= 1; its derivative is finite where autograd's would not be."""
+
+    @staticmethod
+    def forward(ctx: Any, t: Tensor) -> Tensor:
+        height = (1 - t * t).clamp_min(0).sqrt()
+        ctx.save_for_backward(height)
+        return 0.5 * (t * height + torch.atan2(t, height))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
+        (height,) = ctx.saved_tensors
+        return grad * height
+
+
+def _slopes(knots: Tensor) -> Tensor:
+    """Slopes ``(K-1, 2)`` of the left and right edge between the knots; 0 between knots of equal height."""
+    rise = knots[1:, :1] - knots[:-1, :1]
+    flat = rise <= 1e-9
+    return torch.where(flat, 0.0, (knots[1:, 1:] - knots[:-1, 1:]) / torch.where(flat, 1.0, rise))
+
+
+def knot_integrals(knots: Tensor) -> Tensor:
+    """Integrals ``(K, 2)`` of the piecewise linear left and right edge from the first knot to each."""
+    pieces = 0.5 * (knots[1:, 1:] + knots[:-1, 1:]) * (knots[1:, :1] - knots[:-1, :1])
+    return torch.cat([torch.zeros_like(knots[:1, 1:]), pieces.cumsum(0)])
+
+
+def area(profile: Profile) -> Tensor:
+    """Area of the unit shape (the disc has pi)."""
+    knots, bulge = profile
+    left, right = knot_integrals(knots)[-1]
+    return right - left + 0.5 * math.pi * bulge * (knots[-1, 0] - knots[0, 0])
+
+
+def row_span(coc: Tensor, row: int, profile: Profile) -> tuple[Tensor, Tensor, Tensor]:
+    """The rectangle that stands for one row of each PSF.
+
+    Args:
+        coc: ``(N,)`` signed radii in px with ``|coc| >= MIN_RADIUS``.
+        row: offset of the image row from the centre of the PSF.
+        profile: the unit shape, in the dtype of ``coc``.
+
+    Returns:
+        ``left``, ``right`` (px from the centre of the PSF) and ``weight`` (1/px²), each ``(N,)``: the row holds
+        the mass ``weight * (right - left)``, and these sum to 1 over all rows. Rows that the PSF does not reach
+        have weight 0.
+    """
+    knots, bulge = profile
+    bottom, top = knots[0, 0], knots[-1, 0]
+    first, second = (row - 0.5) / coc, (row + 0.5) / coc
+    low = torch.minimum(first, second).clamp(bottom, top)
+    high = torch.maximum(first, second).clamp(bottom, top)
+    height = high - low
+    covered = height > 1e-12
+    safe_height = torch.where(covered, height, 1.0)
+
+    integrals, slopes = knot_integrals(knots), _slopes(knots)
+
+    def edge_integrals(y: Tensor) -> Tensor:
+        k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(
+            0, len(knots) - 2
+        )
+        dy = (y - knots[k, 0])[:, None]
+        return integrals[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
+
+    half = 0.5 * (top - bottom)
+    middle = 0.5 * (top + bottom)
+    linear = (edge_integrals(high) - edge_integrals(low)) / safe_height[:, None]
+    arc = _Semicircle.apply((high - middle) / half) - _Semicircle.apply((low - middle) / half)
+    round_part = bulge * half * arc / safe_height
+
+    one, other = coc * (linear[:, 0] - round_part), coc * (linear[:, 1] + round_part)
+    left, right = torch.minimum(one, other), torch.maximum(one, other)
+    weight = torch.where(covered, height, 0.0) / (coc.abs() * area(profile))
+    return left, right, weight
+
+
+def clamp_radius(coc: Tensor) -> Tensor:
+    """Signed CoC with its radius raised to at least ``MIN_RADIUS`` (0 counts as positive)."""
+    radius = coc.abs().clamp_min(MIN_RADIUS)
+    return torch.where(coc < 0, -radius, radius)

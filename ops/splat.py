@@ -1,0 +1,224 @@
+"""Splatting: every source pixel adds its point-spread function to a buffer.
+
+Two kinds of PSFs. `splat_spans` draws flat convex shapes by the two ends of each row, exact and in closed form;
+`splat_points` draws tables of points, the *spreadlets* of Leimkühler et al., "Laplacian Kernel Splatting for
+Efficient Depth-of-field and Motion Blur Synthesis or Reconstruction" (2018), section 6.
+
+The torch functions here are the definition, on any device and in any floating-point dtype. On CPU in float32 the
+numba kernels of the same functions take over when numba is installed (``pip install torchbokeh[cpu]``). Both
+stand behind one custom operator each, whose backward pass is the adjoint gather: no graph over the points is
+ever built.
+"""
+
+import importlib.util
+import warnings
+from functools import cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.spans import Profile, clamp_radius, row_span, working_dtype
+
+CHUNK = 1 << 22
+"""Most points that the torch path of `splat_points` expands at a time: about 0.3 GB of scratch."""
+
+
+@cache
+def _numba_is_there() -> bool:
+    found = importlib.util.find_spec("numba") is not None
+    if not found:
+        warnings.warn(
+            "numba is not installed: splatting on the CPU takes the slower torch path. "
+            "`pip install torchbokeh[cpu]` brings the fast kernels.",
+            stacklevel=2,
+        )
+    return found
+
+
+def _has_kernel(values: Tensor) -> bool:
+    return values.device.type == "cpu" and values.dtype == torch.float32 and _numba_is_there()
+
+
+def _compute_dtype(*tensors: Tensor) -> torch.dtype:
+    """The common dtype of the tensors, at least float32."""
+    dtype = torch.float32
+    for t in tensors:
+        dtype = torch.promote_types(dtype, t.dtype)
+    return dtype
+
+
+# ------------------------------------------------------------------------------------------------ spans
+
+
+def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: bool = False) -> Tensor:
+    """Splat flat convex PSFs as row intervals: two differences per row, for any radius.
+
+    The result is the derivative along x of the blurred image; the running sum along x
+    (`torchbokeh.ops.integrate.running_sum_x`) is its inverse. Intervals are cut at the image border, where the
+    sum starts, so no padding is needed and nothing that matters is lost: the cost of a pixel is bounded by the
+    number of image rows, and there is no cap on the radius.
+
+    Args:
+        values: ``(B, C, H, W)``, what each pixel spreads.
+        coc: ``(B, 1, H, W)`` signed radius in px; radii below 0.5 give the identity. Must be finite.
+        profile: the unit shape of the PSF, see `torchbokeh.psfs.aperture`.
+        integrate: return the blurred image itself. The sum is then taken in double before it is rounded, so
+            that a pixel of 1e6 leaves no trace on its row.
+
+    Returns:
+        ``(B, C, H, W)`` in the common dtype of ``values`` and ``coc`` (half precision is computed in float32
+        and returned in the dtype of ``values``). Differentiable to ``values``, ``coc`` and ``profile``.
+
+    Raises:
+        TypeError: an argument is not a floating-point tensor.
+        ValueError: shapes or devices do not fit.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.ops.splat import splat_spans
+        >>> from torchbokeh.psfs import Disc
+        >>> dot = torch.zeros(1, 1, 65, 65); dot[..., 32, 32] = 1
+        >>> disc = splat_spans(dot, torch.full_like(dot, 20.0), Disc().profile(), integrate=True)
+        >>> round(disc.sum().item(), 4)
+        1.0
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    b, _, h, w = values.shape
+    check_image("coc", coc, (b, 1, h, w), like=values)
+    check_image("profile.knots", profile.knots, ("K", 3), like=values)
+    check_image("profile.bulge", profile.bulge, (), like=values)
+    dtype = _compute_dtype(values, coc)
+    work = working_dtype(values.device)
+    out = _splat_spans_op(
+        values.to(dtype), coc.to(dtype), profile.knots.to(work), profile.bulge.to(work), integrate
+    )
+    return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
+
+
+def _row_ends(coc: Tensor, row: int, profile: Profile, where: Tensor, size: torch.Size) -> Any:
+    """The interval ends of one PSF row for the pixels ``where`` (flat indices into ``(B, H, W)``).
+
+    Returns the indices of the pixels it concerns into ``where``, then for the left and the right end the flat
+    index of its column in a ``(B, H, W+2)`` buffer, the share of the next column, and the weight of the row.
+    """
+    _, h, w = size
+    y, x = where // w % h, where % w
+    radius = coc.detach().abs() + 1
+    inside = ((y + row >= 0) & (y + row < h) & (radius > abs(row))).nonzero()[:, 0]
+    left, right, weight = row_span(coc[inside], row, profile)
+    base = (where // w + row)[inside] * (w + 2)
+    x = x[inside]
+    ends = []
+    for end in (left, right):
+        u = (end + (x + 0.5)).clamp(0, w)
+        column = u.detach().floor()
+        ends.append((base + column.long(), u - column))
+    return inside, ends[0], ends[1], weight
+
+
+def _splat_spans_torch(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
+    b, c, h, w = values.shape
+    work = working_dtype(values.device)
+    flat = values.movedim(1, 0).reshape(c, -1).to(work)
+    radius = clamp_radius(coc.reshape(-1).to(work))
+    where = torch.arange(b * h * w, device=values.device)
+    out = torch.zeros(c, b * h * (w + 2), dtype=work, device=values.device)
+    for row in _rows(radius, h):
+        pixels, left, right, weight = _row_ends(radius, row, profile, where, torch.Size((b, h, w)))
+        share = flat[:, pixels] * weight
+        for (column, part), signed in ((left, share), (right, -share)):
+            out.index_add_(1, column, signed * (1 - part))
+            out.index_add_(1, column + 1, signed * part)
+    out = out.reshape(c, b, h, w + 2)[..., :w].movedim(0, 1)
+    return (out.cumsum(-1) if integrate else out).to(values.dtype).contiguous()
+
+
+def _rows(radius: Tensor, height: int) -> range:
+    """Row offsets that any PSF of these radii reaches within an image of this height."""
+    if radius.numel() == 0:
+        return range(0)
+    n = int(min(radius.abs().max().item() + 1, height - 1))
+    return range(-n, n + 1)
+
+
+def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) -> list[Tensor]:
+    """Gradients of ``values, coc, knots, bulge``; ``grad`` is that of the differences.
+
+    The splat is linear in the buffer, so its backward pass is the gradient of
+    ``sum(value * weight * (g(left) - g(right)))`` with ``g`` the incoming gradient, interpolated linearly.
+    """
+    b, c, h, w = values.shape
+    work = working_dtype(values.device)
+    g = torch.nn.functional.pad(grad.to(work), (0, 2)).movedim(1, 0).reshape(c, -1)
+    where = torch.arange(b * h * w, device=values.device)
+    with torch.enable_grad():
+        flat = values.detach().movedim(1, 0).reshape(c, -1).to(work).requires_grad_()
+        radius = clamp_radius(coc.detach().reshape(-1).to(work)).requires_grad_()
+        leaf = Profile(*(t.detach().clone().requires_grad_() for t in profile))
+        inputs = (flat, radius, *leaf)
+        total = [torch.zeros_like(t) for t in inputs]
+        for row in _rows(radius.detach(), h):
+            pixels, left, right, weight = _row_ends(radius, row, leaf, where, torch.Size((b, h, w)))
+            mass = 0.0
+            for (column, part), sign in ((left, 1), (right, -1)):
+                mass = mass + sign * (g[:, column] * (1 - part) + g[:, column + 1] * part)
+            energy = (flat[:, pixels] * weight * mass).sum()
+            for t, dt in zip(total, torch.autograd.grad(energy, inputs), strict=True):
+                t += dt
+    moved = (coc.reshape(-1).abs() > 0.5).to(work)
+    return [
+        total[0].reshape(c, b, h, w).movedim(0, 1).to(values.dtype).contiguous(),
+        (total[1] * moved).reshape(coc.shape).to(coc.dtype),
+        *total[2:],
+    ]
+
+
+@torch.library.custom_op("torchbokeh::splat_spans", mutates_args=())
+def _splat_spans_op(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
+    profile = Profile(knots, bulge)
+    if _has_kernel(values):
+        from torchbokeh.ops import _span_kernels
+
+        return _span_kernels.splat_spans(values, coc, profile, integrate)
+    return _splat_spans_torch(values, coc, profile, integrate)
+
+
+@_splat_spans_op.register_fake
+def _(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
+    return torch.empty_like(values, memory_format=torch.contiguous_format)
+
+
+@torch.library.custom_op("torchbokeh::gather_spans", mutates_args=())
+def _gather_spans_op(
+    grad: Tensor, values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, shape: bool
+) -> list[Tensor]:
+    profile = Profile(knots, bulge)
+    if _has_kernel(values) and not shape:
+        from torchbokeh.ops import _span_kernels
+
+        grads = _span_kernels.gather_spans(grad, values, coc, profile)
+        return [*grads, torch.zeros_like(knots), torch.zeros_like(bulge)]
+    return _gather_spans_torch(grad, values, coc, profile)
+
+
+@_gather_spans_op.register_fake
+def _(grad: Tensor, values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, shape: bool) -> list[Tensor]:
+    like = torch.contiguous_format
+    return [torch.empty_like(t, memory_format=like) for t in (values, coc, knots, bulge)]
+
+
+def _spans_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *tensors, ctx.integrate = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _spans_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    if ctx.integrate:  # the adjoint of a running sum runs from the other end
+        grad = grad.to(working_dtype(grad.device)).flip(-1).cumsum(-1).flip(-1)
+    shape = any(ctx.needs_input_grad[2:4])
+    return (*_gather_spans_op(grad, *ctx.saved_tensors, shape), None)
+
+
+_splat_spans_op.register_autograd(_spans_backward, setup_context=_spans_setup)
