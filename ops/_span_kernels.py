@@ -7,52 +7,18 @@ the same order: the result has the same bits for every thread count.
 """
 
 import math
-from typing import Any
 
 import numba as nb
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 from torch import Tensor
 
+from torchbokeh.ops._interleave import add_pair, interleave
 from torchbokeh.ops._threads import run_all
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, area, knot_integrals
 
 BAND = 64
 """Rows of a band: 64 rows of 1024 interleaved double pixels fill the second-level cache of common processors."""
-
-
-@intrinsic
-def _add_pair(typingctx: Any, out: Any, o: Any, src: Any, p: Any, w0: Any, w1: Any) -> Any:
-    """``out[o:o+4] += w0 * src[p:p+4]; out[o+4:o+8] += w1 * src[p:p+4]``, double += float, as one vector."""
-    sig = types.void(out, types.int64, src, types.int64, types.float32, types.float32)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        f4 = ir.VectorType(ir.FloatType(), 4)
-        d8 = ir.VectorType(ir.DoubleType(), 8)
-        i32 = ir.IntType(32)
-        i8 = ir.VectorType(i32, 8)
-        out_data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        src_data = context.make_array(sig.args[2])(context, builder, args[2]).data
-        out_ptr = builder.bitcast(builder.gep(out_data, [args[1]]), d8.as_pointer())
-        src_ptr = builder.bitcast(builder.gep(src_data, [args[3]]), f4.as_pointer())
-        pixel = builder.load(src_ptr)
-        pixel.align = 4
-        weights = builder.insert_element(ir.Constant(f4, ir.Undefined), args[4], i32(0))
-        weights = builder.insert_element(weights, args[5], i32(1))
-        undefined = ir.Constant(f4, ir.Undefined)
-        pixel = builder.shuffle_vector(pixel, undefined, ir.Constant(i8, [0, 1, 2, 3, 0, 1, 2, 3]))
-        weights = builder.shuffle_vector(weights, undefined, ir.Constant(i8, [0, 0, 0, 0, 1, 1, 1, 1]))
-        product = builder.fpext(builder.fmul(pixel, weights), d8)
-        old = builder.load(out_ptr)
-        old.align = 8
-        store = builder.store(builder.fadd(old, product), out_ptr)
-        store.align = 8
-        return context.get_dummy_value()
-
-    return sig, codegen
 
 
 @nb.njit(inline="always")
@@ -130,8 +96,8 @@ def _row_table(r, first, n, shape, bulge, inv_area, table):  # type: ignore[no-u
 @nb.njit(inline="always")
 def _row_range(r, y, bottom, top, y0, y1):  # type: ignore[no-untyped-def]
     """First row and number of rows that a PSF of radius ``r`` at row ``y`` reaches within ``y0 .. y1-1``."""
-    first = max(y0 - y, int(math.ceil(max(r * bottom - 0.5, -1e9))))
-    last = min(y1 - 1 - y, int(math.floor(min(r * top + 0.5, 1e9))))
+    first = max(y0 - y, math.ceil(max(r * bottom - 0.5, -1e9)))
+    last = min(y1 - 1 - y, math.floor(min(r * top + 0.5, 1e9)))
     return first, last - first + 1
 
 
@@ -165,10 +131,10 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
                 w = table[2, k]
                 i = int(left)
                 f = left - i
-                _add_pair(band, o + 4 * i, src, p, np.float32(w * (1.0 - f)), np.float32(w * f))
+                add_pair(band, o + 4 * i, src, p, np.float32(w * (1.0 - f)), np.float32(w * f))
                 i = int(right)
                 f = right - i
-                _add_pair(band, o + 4 * i, src, p, np.float32(-w * (1.0 - f)), np.float32(-w * f))
+                add_pair(band, o + 4 * i, src, p, np.float32(-w * (1.0 - f)), np.float32(-w * f))
                 o += stride
     for y in range(y0, y1):
         o = (y - y0) * stride
@@ -291,14 +257,6 @@ def _shapes(profile: Profile) -> tuple[np.ndarray, float, float]:
     return torch.stack(tables).numpy(), float(profile.bulge), float(inv_area)
 
 
-def _interleave(values: Tensor, fill: int) -> Tensor:
-    """``(B, C, H, W) -> (B*G, H, W, 4)`` with G groups of four channels, the last one filled up with zeros."""
-    b, c, h, w = values.shape
-    if fill:
-        values = torch.nn.functional.pad(values, (0, 0, 0, 0, 0, fill))
-    return values.reshape(b * ((c + fill) // 4), 4, h, w).permute(0, 2, 3, 1).contiguous()
-
-
 def _bands(height: int) -> list[tuple[int, int]]:
     return [(y, min(y + BAND, height)) for y in range(0, height, BAND)]
 
@@ -306,34 +264,32 @@ def _bands(height: int) -> list[tuple[int, int]]:
 def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
     """`torchbokeh.ops.splat.splat_spans` for CPU float32."""
     b, c, h, w = values.shape
-    fill = -c % 4
+    groups = -(-c // 4)
     shapes, bulge, inv_area = _shapes(profile)
-    src = _interleave(values.detach(), fill).numpy()
-    coc_np = coc.detach().numpy()
+    src = interleave(values.detach()).numpy()
+    coc_np = coc.detach().contiguous().numpy()
     extent = max(abs(shapes[0, 0, 0]), abs(shapes[0, -1, 0]))
     reach = (coc.detach().abs().amax((1, 3)).clamp_min(MIN_RADIUS) * extent).numpy()
-    out = torch.empty(b * ((c + fill) // 4), 4, h, w)
+    out = torch.empty(b * groups, 4, h, w)
     out_np = out.numpy()
-    groups = len(src) // b
 
     def work(k: int, y0: int, y1: int) -> None:
         n = k // groups
         flat = src[k].reshape(-1)
         _splat_band(flat, coc_np[n, 0], reach[n], shapes, bulge, inv_area, integrate, y0, y1, out_np[k])
 
-    run_all(work, [(k, y0, y1) for k in range(len(src)) for y0, y1 in _bands(h)])
-    return out.reshape(b, c + fill, h, w)[:, :c].contiguous()
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
+    return out.reshape(b, 4 * groups, h, w)[:, :c].contiguous()
 
 
 def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) -> tuple[Tensor, Tensor]:
     """Adjoint: gradient ``(B, C, H, W)`` of the differences to the gradients of ``values`` and ``coc``."""
     b, c, h, w = values.shape
-    fill = -c % 4
+    groups = -(-c // 4)
     shapes, bulge, inv_area = _shapes(profile)
-    src = _interleave(values.detach(), fill).numpy()
-    differences = torch.nn.functional.pad(_interleave(grad.double(), fill), (0, 0, 0, 2)).numpy()
-    coc_np = coc.detach().numpy()
-    groups = len(src) // b
+    src = interleave(values.detach()).numpy()
+    differences = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 0, 2)).numpy()
+    coc_np = coc.detach().contiguous().numpy()
     grad_src = torch.empty(src.shape)
     grad_coc = torch.zeros(groups, b, 1, h, w, dtype=torch.float64)
     grad_src_np, grad_coc_np = grad_src.numpy(), grad_coc.numpy()
@@ -345,6 +301,6 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
             *(grad_src_np[k].reshape(-1), grad_coc_np[k % groups, n, 0]),
         )
 
-    run_all(work, [(k, y0, y1) for k in range(len(src)) for y0, y1 in _bands(h)])
-    grad_values = grad_src.permute(0, 3, 1, 2).reshape(b, c + fill, h, w)[:, :c].contiguous()
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
+    grad_values = grad_src.permute(0, 3, 1, 2).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
     return grad_values, grad_coc.sum(0).to(coc.dtype)

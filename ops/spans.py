@@ -41,15 +41,18 @@ class _Semicircle(torch.autograd.Function):
     """``∫_0^t sqrt(1 - u²) du`` for |t| <= 1; its derivative is finite where autograd's would not be."""
 
     @staticmethod
-    def forward(ctx: Any, t: Tensor) -> Tensor:
+    def forward(t: Tensor) -> Tensor:
         height = (1 - t * t).clamp_min(0).sqrt()
-        ctx.save_for_backward(height)
         return 0.5 * (t * height + torch.atan2(t, height))
 
     @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
-        (height,) = ctx.saved_tensors
-        return grad * height
+        (t,) = ctx.saved_tensors
+        return grad * (1 - t * t).clamp_min(0).sqrt()
 
 
 def _slopes(knots: Tensor) -> Tensor:

@@ -10,46 +10,17 @@ stand behind one custom operator each, whose backward pass is the adjoint gather
 ever built.
 """
 
-import importlib.util
-import warnings
-from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.points import PointTable, splat_points
 from torchbokeh.ops.spans import Profile, clamp_radius, row_span, working_dtype
 
-CHUNK = 1 << 22
-"""Most points that the torch path of `splat_points` expands at a time: about 0.3 GB of scratch."""
-
-
-@cache
-def _numba_is_there() -> bool:
-    found = importlib.util.find_spec("numba") is not None
-    if not found:
-        warnings.warn(
-            "numba is not installed: splatting on the CPU takes the slower torch path. "
-            "`pip install torchbokeh[cpu]` brings the fast kernels.",
-            stacklevel=2,
-        )
-    return found
-
-
-def _has_kernel(values: Tensor) -> bool:
-    return values.device.type == "cpu" and values.dtype == torch.float32 and _numba_is_there()
-
-
-def _compute_dtype(*tensors: Tensor) -> torch.dtype:
-    """The common dtype of the tensors, at least float32."""
-    dtype = torch.float32
-    for t in tensors:
-        dtype = torch.promote_types(dtype, t.dtype)
-    return dtype
-
-
-# ------------------------------------------------------------------------------------------------ spans
+__all__ = ["PointTable", "splat_points", "splat_spans"]
 
 
 def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: bool = False) -> Tensor:
@@ -89,7 +60,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_image("profile.knots", profile.knots, ("K", 3), like=values)
     check_image("profile.bulge", profile.bulge, (), like=values)
-    dtype = _compute_dtype(values, coc)
+    dtype = compute_dtype(values, coc)
     work = working_dtype(values.device)
     out = _splat_spans_op(
         values.to(dtype), coc.to(dtype), profile.knots.to(work), profile.bulge.to(work), integrate
@@ -107,7 +78,7 @@ def _row_ends(coc: Tensor, row: int, profile: Profile, where: Tensor, size: torc
     y, x = where // w % h, where % w
     radius = coc.detach().abs() + 1
     inside = ((y + row >= 0) & (y + row < h) & (radius > abs(row))).nonzero()[:, 0]
-    left, right, weight = row_span(coc[inside], row, profile)
+    left, right, weight = row_span(coc.index_select(0, inside), row, profile)
     base = (where // w + row)[inside] * (w + 2)
     x = x[inside]
     ends = []
@@ -153,20 +124,20 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
     work = working_dtype(values.device)
     g = torch.nn.functional.pad(grad.to(work), (0, 2)).movedim(1, 0).reshape(c, -1)
     where = torch.arange(b * h * w, device=values.device)
-    with torch.enable_grad():
-        flat = values.detach().movedim(1, 0).reshape(c, -1).to(work).requires_grad_()
-        radius = clamp_radius(coc.detach().reshape(-1).to(work)).requires_grad_()
-        leaf = Profile(*(t.detach().clone().requires_grad_() for t in profile))
-        inputs = (flat, radius, *leaf)
-        total = [torch.zeros_like(t) for t in inputs]
-        for row in _rows(radius.detach(), h):
-            pixels, left, right, weight = _row_ends(radius, row, leaf, where, torch.Size((b, h, w)))
-            mass = 0.0
-            for (column, part), sign in ((left, 1), (right, -1)):
-                mass = mass + sign * (g[:, column] * (1 - part) + g[:, column + 1] * part)
-            energy = (flat[:, pixels] * weight * mass).sum()
-            for t, dt in zip(total, torch.autograd.grad(energy, inputs), strict=True):
-                t += dt
+    size = torch.Size((b, h, w))
+
+    def energy(flat: Tensor, radius: Tensor, knots: Tensor, bulge: Tensor, row: int) -> Tensor:
+        pixels, left, right, weight = _row_ends(radius, row, Profile(knots, bulge), where, size)
+        start, stop = (g[:, column] * (1 - part) + g[:, column + 1] * part for column, part in (left, right))
+        return (flat.index_select(1, pixels) * weight * (start - stop)).sum()
+
+    # Within an operator autograd is off, whatever `torch.enable_grad` says; `torch.func` is not.
+    slopes = torch.func.grad(energy, argnums=(0, 1, 2, 3))
+    inputs = (values.movedim(1, 0).reshape(c, -1).to(work), clamp_radius(coc.reshape(-1).to(work)), *profile)
+    total = [torch.zeros_like(t) for t in inputs]
+    for row in _rows(inputs[1], h):
+        for t, dt in zip(total, slopes(*inputs, row), strict=True):
+            t += dt
     moved = (coc.reshape(-1).abs() > 0.5).to(work)
     return [
         total[0].reshape(c, b, h, w).movedim(0, 1).to(values.dtype).contiguous(),
@@ -178,7 +149,7 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
 @torch.library.custom_op("torchbokeh::splat_spans", mutates_args=())
 def _splat_spans_op(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
     profile = Profile(knots, bulge)
-    if _has_kernel(values):
+    if has_kernel(values):
         from torchbokeh.ops import _span_kernels
 
         return _span_kernels.splat_spans(values, coc, profile, integrate)
@@ -195,7 +166,7 @@ def _gather_spans_op(
     grad: Tensor, values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, shape: bool
 ) -> list[Tensor]:
     profile = Profile(knots, bulge)
-    if _has_kernel(values) and not shape:
+    if has_kernel(values) and not shape:
         from torchbokeh.ops import _span_kernels
 
         grads = _span_kernels.gather_spans(grad, values, coc, profile)

@@ -75,6 +75,7 @@ class Ellipse(Aperture):
         return Profile(torch.stack([-top, top]), (xx - xy * shear).clamp_min(0).sqrt())
 
     def extra_repr(self) -> str:
+        """The settings, for ``print``."""
         return f"squeeze={float(self.squeeze):g}, rotation={float(self.rotation):g}"
 
 
@@ -160,6 +161,7 @@ class Polygon(Aperture):
         return polygon_profile(self.vertices())
 
     def extra_repr(self) -> str:
+        """The settings, for ``print``."""
         return f"blades={self.blades}, rotation={float(self.rotation):g}, curvature={float(self.curvature):g}"
 
 

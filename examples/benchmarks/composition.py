@@ -1,0 +1,151 @@
+"""A small scene with an exact picture: thousands of rays through the lens per pixel.
+
+A floor that runs through the focus plane to a far wall, a sharp subject on it, a strongly defocused ring in front,
+and highlights on the floor, the wall and the ring. `trace` follows rays from points of the lens through the point of
+sharp focus behind each pixel; the pinhole picture and its layers come from the same rays with the lens closed.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.stats import qmc
+from skimage import data
+from torch import Tensor
+
+import torchbokeh as tb
+
+FLOOR, WALL = 0.6, 9.0  # metres below and behind the camera
+SUBJECT = (2.6, -0.15, 0.15, 0.62)  # depth, x, y, radius
+RING = (1.0, 0.14, 0.02, 0.17, 0.27)  # depth, x, y, inner and outer radius
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Size in pixels and the thin lens; the sensor is as wide as the picture."""
+
+    width: int = 480
+    height: int = 360
+    focal_length: float = 0.050
+    f_number: float = 0.3
+    focus_distance: float = 2.6
+    sensor_width: float = 0.050
+
+    @property
+    def lens(self) -> tb.ThinLens:
+        return tb.ThinLens(self.focal_length, self.f_number, self.focus_distance, self.sensor_width)
+
+
+def _photo(name: str) -> Tensor:
+    picture = torch.from_numpy(getattr(data, name)()[..., :3]).permute(2, 0, 1).float() / 255
+    return picture**2.2
+
+
+def _look_up(picture: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Bilinear, mirrored beyond the border: ``u, v`` in pictures' widths, any shape; returns ``(3, *shape)``."""
+    grid = torch.stack([2 * u - 1, 2 * v - 1], -1).reshape(1, 1, -1, 2).to(picture.dtype)
+    out = torch.nn.functional.grid_sample(picture[None], grid, padding_mode="reflection", align_corners=False)
+    return out.reshape(3, *u.shape)
+
+
+def _dots(u: Tensor, v: Tensor, pitch: float, radius: float, share: float) -> Tensor:
+    """1 within round dots that sit in some of the cells of a square grid, 0 elsewhere."""
+    i, j = (u / pitch).floor(), (v / pitch).floor()
+    noise = ((i * 127.1 + j * 311.7).sin() * 43758.5453).remainder(1)
+    centre_u = (i + 0.35 + 0.3 * (noise * 7.3).remainder(1)) * pitch
+    centre_v = (j + 0.35 + 0.3 * (noise * 13.7).remainder(1)) * pitch
+    near = (u - centre_u) ** 2 + (v - centre_v) ** 2 < radius**2
+    return (near & (noise < share)).to(u.dtype)
+
+
+class Tracer:
+    """Colour, depth and coverage of the three surfaces along any rays."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.wall, self.floor, self.face, self.metal = map(_photo, ("coffee", "astronaut", "chelsea", "rocket"))
+
+    def surfaces(self, px: Tensor, py: Tensor, ux: float, uy: float) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Rays through lens point ``u`` (metres) and pixel ``p``: (colour, alpha, depth) front to back."""
+        s = self.scene
+        pixel = s.sensor_width / s.width / s.focal_length
+        fx = (px - s.width / 2) * pixel * s.focus_distance
+        fy = (py - s.height / 2) * pixel * s.focus_distance
+        gx, gy = (fx - ux) / s.focus_distance, (fy - uy) / s.focus_distance  # direction per metre of depth
+
+        def at(z: Tensor | float) -> tuple[Tensor, Tensor]:
+            return ux + gx * z, uy + gy * z
+
+        z, x0, y0, inner, outer = RING
+        x, y = at(z)
+        radius = torch.hypot(x - x0, y - y0)
+        ring = ((radius > inner) & (radius < outer)).float()
+        colour = _look_up(self.metal, x / 0.6, y / 0.6) * 0.7 + 0.05
+        colour = colour + 6 * _dots(x, y, 0.05, 0.004, 0.35) * torch.tensor([1.0, 0.8, 0.5])[:, None]
+        out = [(colour, ring, torch.full_like(x, z))]
+
+        z, x0, y0, outer = SUBJECT
+        x, y = at(z)
+        angle = torch.atan2(y - y0, x - x0)
+        inside = (torch.hypot(x - x0, y - y0) < outer * (1 + 0.12 * (7 * angle).cos())).float()
+        out.append((_look_up(self.face, (x - x0) / 1.6 + 0.5, (y - y0) / 1.4 + 0.5), inside, torch.full_like(x, z)))
+
+        z = torch.where(gy > 1e-6, (FLOOR - uy) / gy.clamp_min(1e-6), math.inf).clamp(max=WALL)
+        x, y = at(z)
+        on_wall = z >= WALL
+        wall = _look_up(self.wall, x / 7 + 0.5, y / 5 + 0.5)
+        wall = wall + 10 * _dots(x, y, 0.5, 0.06, 0.3) * torch.tensor([0.6, 0.8, 1.0])[:, None]
+        floor = _look_up(self.floor, x / 2.5, z / 2.5)
+        floor = floor + 10 * _dots(x, z, 0.45, 0.03, 0.25) * torch.tensor([1.0, 0.9, 0.7])[:, None]
+        out.append((torch.where(on_wall, wall, floor), torch.ones_like(x), z))
+        return out
+
+    def _grid(self, dx: float, dy: float) -> tuple[Tensor, Tensor]:
+        y, x = torch.meshgrid(
+            torch.arange(self.scene.height),
+            torch.arange(self.scene.width),
+            indexing="ij",
+        )
+        return (x + dx).reshape(-1), (y + dy).reshape(-1)
+
+    def truth(self, samples: int, seed: int = 0) -> Tensor:
+        """The picture through the open lens ``(1, 3, H, W)``: one lens point and one pixel offset per sample."""
+        s = self.scene
+        radius = s.focal_length / (2 * s.f_number)
+        total = torch.zeros(3, s.height * s.width)
+        for a, b, c, d in qmc.Sobol(4, seed=seed).random(samples):
+            r, phi = radius * math.sqrt(a), 2 * math.pi * b
+            colour = torch.zeros_like(total)
+            for layer, alpha, _ in reversed(self.surfaces(*self._grid(c, d), r * math.cos(phi), r * math.sin(phi))):
+                colour = torch.where(alpha > 0, layer, colour)
+            total += colour
+        return (total / samples).reshape(1, 3, s.height, s.width).float()
+
+    def pinhole(self, side: int = 8) -> dict[str, Tensor]:
+        """The picture with the lens closed, ``side**2`` rays per pixel, and its layers front to back.
+
+        A pixel's depth is that of the surface that covers most of it: depth does not blend.
+        """
+        s = self.scene
+        offsets = (np.arange(side) + 0.5) / side
+        layers: list[list[Tensor]] = []
+        for dy in offsets:
+            for dx in offsets:
+                for k, (colour, alpha, depth) in enumerate(self.surfaces(*self._grid(dx, dy), 0.0, 0.0)):
+                    if len(layers) == k:
+                        layers.append([torch.zeros(4, colour.shape[1]), torch.zeros_like(depth)])
+                    layers[k][0] += torch.cat([colour * alpha, alpha[None]])
+                    layers[k][1] += depth
+        size = (s.height, s.width)
+        rgba = torch.stack([c.reshape(4, *size) / side**2 for c, _ in layers]).float()
+        depth = torch.stack([d.reshape(1, *size) / side**2 for _, d in layers]).float()
+        image, front, left = torch.zeros(3, *size), torch.zeros(1, *size), torch.ones(1, *size)
+        seen = torch.zeros(1, *size)
+        for layer, z in zip(rgba, depth, strict=True):
+            image += left * layer[:3]
+            visible = left * layer[3:]
+            front = torch.where(visible > seen, z, front)
+            seen = torch.maximum(seen, visible)
+            left = left * (1 - layer[3:])
+        return {"image": image[None], "depth": front[None], "layers": rgba[None], "layer_depth": depth[None]}

@@ -1,0 +1,34 @@
+"""Which path an operator takes: the numba kernel or the torch definition, and in which dtype."""
+
+import importlib.util
+import warnings
+from functools import cache
+
+import torch
+from torch import Tensor
+
+
+@cache
+def numba_is_there() -> bool:
+    """Whether numba can be imported; warns the first time that it cannot."""
+    found = importlib.util.find_spec("numba") is not None
+    if not found:
+        warnings.warn(
+            "numba is not installed: splatting on the CPU takes the slower torch path. "
+            "`pip install torchbokeh[cpu]` brings the fast kernels.",
+            stacklevel=2,
+        )
+    return found
+
+
+def has_kernel(values: Tensor) -> bool:
+    """Whether the numba kernels take these values: float32 on the CPU, and numba is installed."""
+    return values.device.type == "cpu" and values.dtype == torch.float32 and numba_is_there()
+
+
+def compute_dtype(*tensors: Tensor) -> torch.dtype:
+    """The common dtype of the tensors, at least float32."""
+    dtype = torch.float32
+    for t in tensors:
+        dtype = torch.promote_types(dtype, t.dtype)
+    return dtype

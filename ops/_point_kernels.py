@@ -1,0 +1,178 @@
+"""numba kernels of `splat_points` for CPU float32: the same numbers as the torch definition, faster.
+
+Source rows are cut into bands whose number depends on the height of the image only. Each band adds to a double
+buffer of its own, and the buffers are added in order: the result has the same bits for every thread count.
+"""
+
+import math
+
+import numba as nb
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchbokeh.ops._interleave import add_one, add_pair, interleave
+from torchbokeh.ops._threads import run_all
+
+BANDS = 16
+MIN_ROWS = 8
+"""Bands of an image and the least number of rows in one: each band's buffer is higher than it by the PSFs' reach."""
+
+
+@nb.njit(inline="always")
+def _frame(rotation, position, y, x):  # type: ignore[no-untyped-def]
+    """Centre and matrix of the PSF of pixel (y, x). Arrays that were not given are empty."""
+    u, v = np.float64(x), np.float64(y)
+    if position.size > 0:
+        u, v = position[0, y, x], position[1, y, x]
+    if rotation.size > 0:
+        return u, v, rotation[0, 0, y, x], rotation[0, 1, y, x], rotation[1, 0, y, x], rotation[1, 1, y, x]
+    return u, v, 1.0, 0.0, 0.0, 1.0
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _splat_band(src, index, points, counts, rotation, position, pad, y0, y1, first, out):  # type: ignore[no-untyped-def]
+    """Splat source rows ``y0 .. y1-1`` into ``out (N+2, Wp+2, 4)``.
+
+    Its inner rows are the rows ``first .. first+N-1`` of the padded buffer. The border of one catches the corners
+    that stick out.
+    """
+    width = index.shape[1]
+    rows, stride = out.shape[0], out.shape[1]
+    flat = out.reshape(-1)
+    for y in range(y0, y1):
+        for x in range(width):
+            p = 4 * (y * width + x)
+            if src[p] == 0.0 and src[p + 1] == 0.0 and src[p + 2] == 0.0 and src[p + 3] == 0.0:
+                continue
+            u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
+            u0 += pad + 1
+            v0 += pad + 1 - first
+            psf = index[y, x]
+            for k in range(counts[psf], counts[psf + 1]):
+                dx, dy = points[k, 0], points[k, 1]
+                u = u0 + xx * dx + xy * dy
+                v = v0 + yx * dx + yy * dy
+                if not (0.0 <= u < stride - 1 and 0.0 <= v < rows - 1):
+                    continue
+                i, j = int(u), int(v)
+                f, g = u - i, v - j
+                w = points[k, 2]
+                o = 4 * (j * stride + i)
+                if f == 0.0 and g == 0.0:
+                    add_one(flat, o, src, p, np.float32(w))
+                else:
+                    upper, lower = w * (1.0 - g), w * g
+                    add_pair(flat, o, src, p, np.float32(upper * (1.0 - f)), np.float32(upper * f))
+                    o += 4 * stride
+                    add_pair(flat, o, src, p, np.float32(lower * (1.0 - f)), np.float32(lower * f))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_band(grad, index, points, counts, rotation, position, pad, y0, y1, out):  # type: ignore[no-untyped-def]
+    """Adjoint for the source rows ``y0 .. y1-1`` of ``out (H, W, 4)``; ``grad (Hp+2, Wp+2, 4)`` has a border of 0."""
+    width = index.shape[1]
+    rows, stride = grad.shape[0], grad.shape[1]
+    total = np.empty(4, np.float64)
+    for y in range(y0, y1):
+        for x in range(width):
+            u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
+            u0 += pad + 1
+            v0 += pad + 1
+            total[:] = 0.0
+            psf = index[y, x]
+            for k in range(counts[psf], counts[psf + 1]):
+                dx, dy = points[k, 0], points[k, 1]
+                u = u0 + xx * dx + xy * dy
+                v = v0 + yx * dx + yy * dy
+                if not (0.0 <= u < stride - 1 and 0.0 <= v < rows - 1):
+                    continue
+                i, j = int(u), int(v)
+                f, g = u - i, v - j
+                w = points[k, 2]
+                for ch in range(4):
+                    upper = grad[j, i, ch] + f * (grad[j, i + 1, ch] - grad[j, i, ch])
+                    lower = grad[j + 1, i, ch] + f * (grad[j + 1, i + 1, ch] - grad[j + 1, i, ch])
+                    total[ch] += w * (upper + g * (lower - upper))
+            for ch in range(4):
+                out[y, x, ch] = total[ch]
+
+
+def _bands(height: int) -> list[tuple[int, int]]:
+    rows = max(MIN_ROWS, -(-height // BANDS))
+    return [(y, min(y + rows, height)) for y in range(0, height, rows)]
+
+
+def _row_range(
+    low: float, high: float, points: Tensor, rotation: Tensor | None, position: Tensor | None
+) -> tuple[int, int]:
+    """First row that source rows ``low .. high`` of one image reach and one past the last, in the unpadded image."""
+    extent = torch.nn.functional.pad(points[:, :2].abs(), (0, 0, 0, 1)).amax(0)
+    reach = extent[1] if rotation is None else (rotation[1].abs().amax((1, 2)) * extent).sum()
+    if position is not None:
+        low, high = position[1].min().item(), position[1].max().item()
+    return math.floor(low - float(reach)), math.floor(high + float(reach)) + 2
+
+
+def _arrays(
+    index: Tensor, points: Tensor, counts: Tensor, rotation: Tensor | None, position: Tensor | None
+) -> list[tuple[np.ndarray, ...]]:
+    """For each image the arrays that the kernels take; empty ones where rotation or position are not given."""
+    b = len(index)
+    turn = points.new_empty(b, 2, 2, 0, 0) if rotation is None else rotation.detach().contiguous()
+    place = points.new_empty(b, 2, 0, 0) if position is None else position.detach().contiguous()
+    table = (points.detach().contiguous().numpy(), counts.contiguous().numpy())
+    psf = index.contiguous()
+    return [(psf[n, 0].numpy(), *table, turn[n].numpy(), place[n].numpy()) for n in range(b)]
+
+
+def splat_points(
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    pad: int,
+) -> Tensor:
+    """`torchbokeh.ops.points.splat_points` for CPU float32; points are ``(P, 3)``: dx, dy, weight."""
+    b, c, h, w = values.shape
+    rows, columns = h + 2 * pad, w + 2 * pad
+    groups = -(-c // 4)
+    src = interleave(values.detach()).reshape(b * groups, -1).numpy()
+    arrays = _arrays(index, points, counts, rotation, position)
+    out = torch.empty(b * groups, 4, rows, columns)
+    for k in range(b * groups):
+        n = k // groups
+        pieces = []
+        for y0, y1 in _bands(h):
+            near = [None if t is None else t[n, ..., y0:y1, :] for t in (rotation, position)]
+            first, end = (min(max(y + pad, 0), rows) for y in _row_range(y0, y1 - 1, points, *near))
+            buffer = np.zeros((end - first + 2, columns + 2, 4))
+            pieces.append((src[k], *arrays[n], pad, y0, y1, first, buffer))
+        run_all(_splat_band, pieces)
+        total = torch.zeros(rows, columns, 4, dtype=torch.float64)
+        for *_, first, buffer in pieces:
+            total[first : first + len(buffer) - 2] += torch.from_numpy(buffer[1:-1, 1:-1])
+        out[k] = total.permute(2, 0, 1)
+    return out.reshape(b, 4 * groups, rows, columns)[:, :c].contiguous()
+
+
+def gather_points(
+    grad: Tensor, index: Tensor, points: Tensor, counts: Tensor, rotation: Tensor | None, position: Tensor | None
+) -> Tensor:
+    """Adjoint: gradient ``(B, C, Hp, Wp)`` of the buffer to that of the values ``(B, C, H, W)``."""
+    b, c = grad.shape[:2]
+    h, w = index.shape[-2:]
+    pad = (grad.shape[-1] - w) // 2
+    groups = -(-c // 4)
+    buffer = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 1, 1, 1, 1)).numpy()
+    arrays = _arrays(index, points, counts, rotation, position)
+    out = torch.empty(b * groups, h, w, 4)
+    pieces = [
+        (buffer[k], *arrays[k // groups], pad, y0, y1, out[k].numpy())
+        for k in range(b * groups)
+        for y0, y1 in _bands(h)
+    ]
+    run_all(_gather_band, pieces)
+    return out.permute(0, 3, 1, 2).reshape(b, 4 * groups, h, w)[:, :c].contiguous()

@@ -1,0 +1,331 @@
+"""Splatting tables of points: the *spreadlets* of Leimkühler et al., "Laplacian Kernel Splatting for Efficient
+Depth-of-field and Motion Blur Synthesis or Reconstruction" (2018), sections 6.1 and 6.2.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.spans import working_dtype
+
+CHUNK = 1 << 21
+"""Most points that the torch path expands at a time: about 0.4 GB of scratch for four channels."""
+
+_MARGIN = 2  # rows and columns around the torch path's buffer that catch what lands outside
+
+
+class PointTable(NamedTuple):
+    """K point-spread functions as lists of points, one after the other (LKS section 6.1: P, V and C).
+
+    Attributes:
+        offsets: ``(P, 2)`` points as (dx, dy) in px from the centre of their PSF; y runs downwards.
+        weights: ``(P,)`` what each point adds per unit of the pixel's value.
+        counts: ``(K+1,)`` integers from 0 up to P; PSF ``i`` owns the points ``counts[i] .. counts[i+1]-1``.
+    """
+
+    offsets: Tensor
+    weights: Tensor
+    counts: Tensor
+
+
+def splat_points(
+    values: Tensor,
+    index: Tensor,
+    table: PointTable,
+    *,
+    pad: int,
+    rotation: Tensor | None = None,
+    position: Tensor | None = None,
+) -> Tensor:
+    """Splat a PSF from a table for every pixel (LKS section 6.2).
+
+    Each pixel adds ``value * weight`` at ``position + rotation @ offset + pad`` for all points of its PSF. A target
+    between pixels is shared bilinearly by the four around it, so whole targets are exact. Points that land outside
+    the padded buffer are dropped: pad by at least the reach of the PSFs, or a later integration smears what is
+    missing over the image. Pixels whose values are all zero cost nothing.
+
+    Args:
+        values: ``(B, C, H, W)``, what each pixel spreads.
+        index: ``(B, 1, H, W)`` integers, which PSF of the table each pixel takes.
+        table: the PSFs.
+        pad: width in px of the border that is added on all four sides.
+        rotation: ``(B, 2, 2, H, W)`` matrices that turn (or scale) the offsets of each pixel. Default: none.
+        position: ``(B, 2, H, W)`` where the centre of the PSF goes, x and y in px of the unpadded image, 0 being the
+            centre of its first pixel. Default: the pixel itself. LKS calls this y'. Must be finite.
+
+    Returns:
+        ``(B, C, H + 2 pad, W + 2 pad)`` in the dtype of ``values`` (half precision is computed in float32).
+        Differentiable to ``values``, ``offsets``, ``weights``, ``rotation`` and ``position``; at a whole target the
+        derivative to its place is the one towards larger coordinates.
+
+    Raises:
+        TypeError: an argument has the wrong type or kind of dtype.
+        ValueError: shapes or devices do not fit, ``pad`` is negative, ``counts`` does not run from 0 up to P, or
+            ``index`` points outside the table.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.ops.splat import PointTable, splat_points
+        >>> plus = torch.tensor([[0.0, -1.0], [-1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        >>> table = PointTable(plus, torch.full((4,), 0.25), torch.tensor([0, 4]))
+        >>> splat_points(torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=torch.int64), table, pad=1)[0, 0]
+        tensor([[0.0000, 0.2500, 0.0000],
+                [0.2500, 0.0000, 0.2500],
+                [0.0000, 0.2500, 0.0000]])
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    b, _, h, w = values.shape
+    check_image("index", index, (b, 1, h, w), like=values, integer=True)
+    check_image("table.offsets", table.offsets, ("P", 2), like=values)
+    check_image("table.weights", table.weights, (len(table.offsets),), like=values)
+    check_image("table.counts", table.counts, ("K+1",), like=values, integer=True)
+    if len(table.counts) == 0:
+        raise ValueError("table.counts: expected at least the leading 0, got no entries")
+    if rotation is not None:
+        check_image("rotation", rotation, (b, 2, 2, h, w), like=values)
+    if position is not None:
+        check_image("position", position, (b, 2, h, w), like=values)
+    if not isinstance(pad, int) or isinstance(pad, bool):
+        raise TypeError(f"pad: expected an int, got {type(pad).__name__}")
+    if pad < 0:
+        raise ValueError(f"pad: expected 0 or more, got {pad}")
+    work = working_dtype(values.device)
+    out = _splat_points_op(
+        values.to(compute_dtype(values)),
+        index.long(),
+        torch.cat([table.offsets.to(work), table.weights.to(work)[:, None]], 1),
+        table.counts.long(),
+        None if rotation is None else rotation.to(work),
+        None if position is None else position.to(work),
+        pad,
+    )
+    return out.to(values.dtype)
+
+
+def _check_contents(index: Tensor, points: Tensor, counts: Tensor) -> None:
+    """What only the numbers tell. Runs inside the operator, so that compiled code is checked as well."""
+    if not bool((counts[0] == 0) & (counts[-1] == len(points)) & (counts.diff() >= 0).all()):
+        raise ValueError(f"table.counts: expected ascending numbers from 0 to {len(points)}, got {counts.tolist()}")
+    if index.numel() == 0:
+        return
+    low, high = torch.stack(index.aminmax()).tolist()
+    psfs = len(counts) - 1
+    if low < 0 or high >= psfs:
+        raise ValueError(f"index: expected 0 to {psfs - 1}, a PSF of the table, got {low} to {high}")
+
+
+def _flatten(t: Tensor) -> Tensor:
+    """``(B, ..., H, W) -> (..., B*H*W)``."""
+    return t.movedim(0, -3).reshape(*t.shape[1:-2], -1)
+
+
+def _unflatten(t: Tensor, like: Tensor) -> Tensor:
+    """Undo `_flatten`, in the shape and dtype of ``like``."""
+    b, *inner, h, w = like.shape
+    return t.reshape(*inner, b, h, w).movedim(-3, 0).to(like.dtype).contiguous()
+
+
+def _expand(index: Tensor, counts: Tensor, alive: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """For all points of the ``alive`` pixels ``(B*H*W,)``: the pixel and the number of the point in the table.
+
+    They come in pieces of at most `CHUNK` points, or of a single pixel.
+    """
+    psf = index.reshape(-1)
+    size = counts.diff()[psf]
+    where = (alive & (size > 0)).nonzero()[:, 0]
+    ends = size[where].cumsum(0)
+    start, done = 0, 0
+    while start < len(where):
+        stop = max(int(torch.searchsorted(ends, done + CHUNK, right=True)), start + 1)
+        piece = where[start:stop]
+        n = size[piece]
+        pixels = piece.repeat_interleave(n)
+        first = counts[psf[piece]] - (n.cumsum(0) - n)
+        yield pixels, first.repeat_interleave(n) + torch.arange(len(pixels), device=index.device)
+        start, done = stop, int(ends[stop - 1])
+
+
+def _shares(
+    pixels: Tensor,
+    points: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    size: tuple[int, int],
+    pad: int,
+) -> list[tuple[Tensor, Tensor]]:
+    """The four cells that each point ``(N, 3)`` adds to, and how much of its pixel's value goes there.
+
+    ``pixels`` are flat indices into ``(B, H, W)``, as for ``rotation (2, 2, B*H*W)`` and ``position (2, B*H*W)``;
+    cells are flat indices into the padded buffer with its margin.
+    """
+    h, w = size
+    target, weight = points[:, :2].T, points[:, 2]
+    if rotation is not None:
+        target = (rotation.index_select(2, pixels) * target).sum(1)
+    if position is not None:
+        target = target + position.index_select(1, pixels)
+    else:
+        target = target + torch.stack([pixels % w, pixels // w % h])
+    x, y = target + pad
+    column = x.detach().floor().clamp(-_MARGIN, w + 2 * pad)
+    row = y.detach().floor().clamp(-_MARGIN, h + 2 * pad)
+    right, down = x - column, y - row
+    rows, stride = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
+    cell = (pixels // (h * w) * rows + row.long() + _MARGIN) * stride + column.long() + _MARGIN
+    return [
+        (cell, weight * (1 - down) * (1 - right)),
+        (cell + 1, weight * (1 - down) * right),
+        (cell + stride, weight * down * (1 - right)),
+        (cell + stride + 1, weight * down * right),
+    ]
+
+
+def _splat_points_torch(
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    pad: int,
+) -> Tensor:
+    b, c, h, w = values.shape
+    rows, columns = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
+    work = working_dtype(values.device)
+    flat = _flatten(values).to(work)
+    turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
+    out = torch.zeros(c, b * rows * columns, dtype=work, device=values.device)
+    for pixels, numbers in _expand(index, counts, (flat != 0).any(0)):
+        source = flat.index_select(1, pixels)
+        for cell, share in _shares(pixels, points[numbers], turn, place, (h, w), pad):
+            if share.any():  # of the four corners of a whole target three get nothing
+                out.index_add_(1, cell, source * share)
+    inner = slice(_MARGIN, -_MARGIN)
+    return _unflatten(out, values.new_empty(b, c, rows, columns))[..., inner, inner].contiguous()
+
+
+def _gather_points_torch(
+    grad: Tensor,
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    geometry: bool,
+) -> list[Tensor]:
+    """Gradients of ``values`` and, if ``geometry``, of ``points``, ``rotation`` and ``position`` as far as given.
+
+    The splat is linear in the buffer, so its backward pass is the gradient of ``sum(value * weight * g(target))``
+    with ``g`` the incoming gradient, interpolated bilinearly. It is taken piece by piece.
+    """
+    h, w = values.shape[-2:]
+    pad = (grad.shape[-1] - w) // 2
+    work = working_dtype(values.device)
+    g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
+    size = torch.Size((h, w))
+
+    def energy(flat: Tensor, table: Tensor, turn: Tensor | None, place: Tensor | None, at: tuple[Tensor, ...]) -> Tensor:
+        pixels, numbers = at
+        shares = _shares(pixels, table.index_select(0, numbers), turn, place, size, pad)
+        mass = sum(share * g.index_select(1, cell) for cell, share in shares)
+        return (flat.index_select(1, pixels) * mass).sum()
+
+    given = (values, points, rotation, position)
+    inputs = [t if t is None or t is points else _flatten(t).to(work) for t in given]
+    wanted = [k for k, t in enumerate(given) if t is not None and (geometry or k == 0)]
+    # Within an operator autograd is off, whatever `torch.enable_grad` says; `torch.func` is not.
+    slopes = torch.func.grad(energy, argnums=tuple(wanted))
+    total = [torch.zeros_like(inputs[k]) for k in wanted]
+    for at in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
+        for t, dt in zip(total, slopes(*inputs, at), strict=True):
+            t += dt
+    return [t if given[k] is points else _unflatten(t, given[k]) for k, t in zip(wanted, total, strict=True)]
+
+
+@torch.library.custom_op("torchbokeh::splat_points", mutates_args=())
+def _splat_points_op(
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    pad: int,
+) -> Tensor:
+    """Points are ``(P, 3)``: dx, dy, weight."""
+    _check_contents(index, points, counts)
+    if has_kernel(values):
+        from torchbokeh.ops import _point_kernels
+
+        return _point_kernels.splat_points(values, index, points, counts, rotation, position, pad)
+    return _splat_points_torch(values, index, points, counts, rotation, position, pad)
+
+
+@_splat_points_op.register_fake
+def _(
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    pad: int,
+) -> Tensor:
+    b, c, h, w = values.shape
+    return values.new_empty(b, c, h + 2 * pad, w + 2 * pad)
+
+
+@torch.library.custom_op("torchbokeh::gather_points", mutates_args=())
+def _gather_points_op(
+    grad: Tensor,
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    geometry: bool,
+) -> list[Tensor]:
+    if has_kernel(values) and not geometry:
+        from torchbokeh.ops import _point_kernels
+
+        return [_point_kernels.gather_points(grad, index, points, counts, rotation, position)]
+    return _gather_points_torch(grad, values, index, points, counts, rotation, position, geometry)
+
+
+@_gather_points_op.register_fake
+def _(
+    grad: Tensor,
+    values: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    geometry: bool,
+) -> list[Tensor]:
+    inputs = (values, points, rotation, position) if geometry else (values,)
+    return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs if t is not None]
+
+
+def _points_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    ctx.save_for_backward(*inputs[:-1])
+
+
+def _points_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    _, _, points, _, rotation, position = ctx.saved_tensors
+    geometry = any(ctx.needs_input_grad[k] for k in (2, 4, 5))
+    by_values, *rest = _gather_points_op(grad, *ctx.saved_tensors, geometry)
+    found = iter(rest)
+    by_points, by_rotation, by_position = (
+        next(found) if geometry and t is not None else None for t in (points, rotation, position)
+    )
+    return by_values, None, by_points, None, by_rotation, by_position, None
+
+
+_splat_points_op.register_autograd(_points_backward, setup_context=_points_setup)

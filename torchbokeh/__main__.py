@@ -1,0 +1,8 @@
+"""``python -m torchbokeh``: the same as the console script ``torchbokeh``."""
+
+import sys
+
+from torchbokeh.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

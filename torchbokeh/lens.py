@@ -1,0 +1,394 @@
+"""Lenses: from depth, or disparity, to the signed circle of confusion (CoC) and back."""
+
+import math
+from abc import ABC, abstractmethod
+from numbers import Real
+
+import torch
+from torch import Tensor, nn
+
+
+class Lens(nn.Module, ABC):
+    """What every lens can do: turn depth into a signed CoC radius in pixels, and back.
+
+    A lens parameter is a scalar, or ``(B,)`` with one value for each item of the batch, the first dimension
+    of the maps. Numbers and tensors are kept as buffers (float32 for numbers), so they follow ``.to()`` and
+    are saved; an ``nn.Parameter`` stays the very same parameter and receives a gradient. Parameters are
+    checked when the lens is built, not at each call: whoever optimises one keeps it in its range.
+
+    Maps have shape ``(B, 1, H, W)``, or any ``(..., H, W)``; parameters of shape ``(B,)`` with B > 1 need the
+    batch dimension. Results have the shape of the map and its dtype, but float32 for half precision.
+    """
+
+    @abstractmethod
+    def coc(self, depth: Tensor, width: int) -> Tensor:
+        """Signed CoC radius in pixels, positive behind the focus plane; ``width`` is the image's."""
+
+    @abstractmethod
+    def depth(self, coc: Tensor, width: int) -> Tensor:
+        """Inverse of :meth:`coc`: the depth at which the signed CoC radius is ``coc`` pixels."""
+
+    def forward(self, depth: Tensor, width: int) -> Tensor:
+        """Same as :meth:`coc`."""
+        return self.coc(depth, width)
+
+    def extra_repr(self) -> str:
+        """Name and value of every parameter."""
+        return ", ".join(f"{name}={_show(value)}" for name, value in self._values().items())
+
+    def _values(self) -> dict[str, Tensor]:
+        """Every parameter and buffer, in the order in which :meth:`_hold` got them."""
+        return {name: getattr(self, name) for name in self._names}
+
+    def _hold(self, **values: float | Tensor) -> None:
+        """Keep lens parameters: numbers and tensors as buffers, an ``nn.Parameter`` as the one it is."""
+        # Numbers join the tensors' device: a focus distance predicted on a GPU needs no further .to().
+        device = next((v.device for v in values.values() if isinstance(v, Tensor)), None)
+        batched: tuple[str, int] | None = None
+        self._names = tuple(values)
+        for name, value in values.items():
+            if isinstance(value, Real) and not isinstance(value, bool):
+                value = torch.tensor(float(value), dtype=torch.float32, device=device)
+            elif not isinstance(value, Tensor):
+                raise TypeError(f"{name}: expected a number or a tensor, got {type(value).__name__}")
+            if not value.is_floating_point():
+                raise TypeError(f"{name}: expected a floating-point tensor, got {value.dtype}")
+            if value.device != device and device is not None:
+                raise ValueError(f"{name}: expected device {device}, got {value.device}")
+            if value.dim() > 1:
+                raise ValueError(f"{name}: expected a scalar or shape (B,), got {tuple(value.shape)}")
+            if value.dim() == 1:
+                batched = batched or (name, len(value))
+                if len(value) != batched[1]:
+                    raise ValueError(
+                        f"{name}: expected a scalar or shape ({batched[1]},) like {batched[0]}, got ({len(value)},)"
+                    )
+            if isinstance(value, nn.Parameter):
+                self.register_parameter(name, value)
+            else:
+                self.register_buffer(name, value)
+
+    def _align(self, name: str, x: Tensor, width: int) -> list[Tensor]:
+        """Check a map and the image width; return the map and the parameters, all ready to broadcast."""
+        if not isinstance(x, Tensor):
+            raise TypeError(f"{name}: expected a tensor of shape (..., H, W), got {type(x).__name__}")
+        if not x.is_floating_point():
+            raise TypeError(f"{name}: expected a floating-point tensor, got {x.dtype}")
+        if x.dim() < 2:
+            raise ValueError(f"{name}: expected shape (..., H, W), got {tuple(x.shape)}")
+        _check_width(width)
+        # A map of less than float32 would lose the difference of two nearly equal reciprocals.
+        dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
+        out = [x.to(dtype)]
+        for value in self._values().values():
+            if value.device != x.device:
+                raise ValueError(f"{name}: expected the lens's device {value.device}, got {x.device}")
+            value = value.to(dtype)
+            if value.dim() == 1:
+                if len(value) > 1 and (x.dim() < 3 or x.shape[0] != len(value)):
+                    raise ValueError(
+                        f"{name}: expected a batch of {len(value)} like the lens, got shape {tuple(x.shape)}"
+                    )
+                value = value.view(-1, *[1] * (x.dim() - 1))
+            out.append(value)
+        return out
+
+
+class ThinLens(Lens):
+    """A thin lens: focal length, f-number, focus distance and sensor width say how large the blur is.
+
+    The CoC radius in pixels is, with ``E = focal_length / (2 * f_number)`` the radius of the aperture::
+
+        coc = E * F / (df - F) * (d - df) / d * width / sensor_width
+
+    positive behind the focus distance ``df``, negative before it. It is evaluated in reciprocal distances, as
+    ``E * F * (1/df - 1/d) / (1 - F/df)``, so ``d = inf`` (sky) and ``df = inf`` take their limits, and so do
+    the gradients.
+
+    Args:
+        focal_length: F, in metres, > 0.
+        f_number: N, > 0; the aperture is ``F / N`` wide.
+        focus_distance: df, in metres from the lens, > F; ``inf`` focuses on infinity.
+        sensor_width: in metres, > 0; the image's ``width`` pixels cover it.
+
+    Each is a number, a 0-d or ``(B,)`` floating-point tensor, or an ``nn.Parameter``. Numbers are held in
+    float32; give float64 tensors where the last digits count.
+
+    Raises:
+        TypeError: not a number or floating-point tensor.
+        ValueError: out of its range, or shapes or devices that do not go together.
+
+    Source: the defocus equation (3.2) of the defocus and bokeh dissertation.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.lens import ThinLens
+        >>> lens = ThinLens(focal_length=0.050, f_number=1.8, focus_distance=2.0, sensor_width=0.036)
+        >>> depth = torch.tensor([1.0, 2.0, torch.inf]).view(1, 1, 1, 3)
+        >>> [round(r, 2) for r in lens.coc(depth, width=1920).flatten().tolist()]
+        [-18.99, 0.0, 18.99]
+    """
+
+    focal_length: Tensor
+    f_number: Tensor
+    focus_distance: Tensor
+    sensor_width: Tensor
+
+    def __init__(
+        self,
+        focal_length: float | Tensor,
+        f_number: float | Tensor,
+        focus_distance: float | Tensor,
+        sensor_width: float | Tensor,
+    ) -> None:
+        super().__init__()
+        self._hold(
+            focal_length=focal_length,
+            f_number=f_number,
+            focus_distance=focus_distance,
+            sensor_width=sensor_width,
+        )
+        for name in ("focal_length", "f_number", "sensor_width"):
+            value = getattr(self, name)
+            _check_parameter(name, value, (value > 0) & value.isfinite(), "a positive finite value")
+        focus, focal = torch.broadcast_tensors(self.focus_distance, self.focal_length)
+        nearest = focal[~(focus > focal)][:1].tolist()
+        if nearest:
+            want = f"more than the focal length ({nearest[0]:g} m)"
+            _check_parameter("focus_distance", focus, focus > focal, want)
+
+    @property
+    def aperture_radius(self) -> Tensor:
+        """``E = focal_length / (2 * f_number)`` in metres, of the parameters' shape: scalar or ``(B,)``."""
+        return self.focal_length / (2 * self.f_number)
+
+    def coc(self, depth: Tensor, width: int) -> Tensor:
+        """Signed CoC radius in pixels, positive behind the focus distance.
+
+        Args:
+            depth: ``(B, 1, H, W)`` or ``(..., H, W)``, metres along the optical axis, > 0; ``inf`` is sky.
+            width: width of the whole image in pixels.
+
+        Returns:
+            The shape of ``depth``, float32 or float64. Finite at ``inf``, with gradient 0 to such a depth.
+
+        Raises:
+            TypeError: ``depth`` is no floating-point tensor, or ``width`` no integer.
+            ValueError: wrong shape or device, ``width`` < 1, or a depth <= 0 or NaN. Looking at the values
+                costs a device synchronisation and is left out in ``torch.compile`` and ``torch.export``.
+
+        Example:
+            >>> lens = ThinLens(0.050, 1.8, focus_distance=torch.inf, sensor_width=0.036)
+            >>> lens.coc(torch.full((1, 1, 2, 2), torch.inf), width=1920).abs().max().item()
+            0.0
+        """
+        d, f, n, df, sensor = self._align("depth", depth, width)
+        if not torch.compiler.is_compiling():
+            _check_map("depth", d, d > 0, "values above 0 (inf is sky)")
+        gain, focus = _optics(f, n, df, sensor, width)
+        # reciprocal(), not a quotient: its derivative, minus its own square, is 0 at inf and never NaN.
+        return gain * (focus - d.reciprocal())
+
+    def depth(self, coc: Tensor, width: int) -> Tensor:
+        """Depth in metres at which the signed CoC radius is ``coc``: the inverse of :meth:`coc`.
+
+        The CoC grows towards a limit as the depth goes to infinity. At that limit and beyond it the answer is
+        ``inf``, with gradient 0. NaN stays NaN.
+
+        Args:
+            coc: ``(B, 1, H, W)`` or ``(..., H, W)``, signed radius in pixels.
+            width: width of the whole image in pixels.
+
+        Returns:
+            The shape of ``coc``, float32 or float64.
+
+        Raises:
+            TypeError: ``coc`` is no floating-point tensor, or ``width`` no integer.
+            ValueError: wrong shape or device, or ``width`` < 1.
+
+        Example:
+            >>> lens = ThinLens(0.050, 1.8, focus_distance=2.0, sensor_width=0.036)
+            >>> lens.depth(torch.tensor([[0.0, 100.0]]), width=1920).tolist()
+            [[2.0, inf]]
+        """
+        c, f, n, df, sensor = self._align("coc", coc, width)
+        gain, focus = _optics(f, n, df, sensor, width)
+        # The same product as coc() forms at infinity, so that its limit comes back as exactly 1 / inf.
+        return _distance((gain * focus - c) / gain)
+
+    def hyperfocal(self, max_coc: float, width: int) -> Tensor:
+        """Shortest focus distance that keeps infinity sharp.
+
+        It is ``F * (1 + E * width / (sensor_width * max_coc))``, whatever the lens's own focus distance.
+        Focused there, the far limit is infinity and the near limit exactly half this distance.
+
+        Args:
+            max_coc: largest CoC radius in pixels that still counts as sharp, > 0.
+            width: width of the whole image in pixels.
+
+        Returns:
+            Metres, of the parameters' shape: scalar or ``(B,)``.
+
+        Raises:
+            TypeError: ``max_coc`` is no number, or ``width`` no integer.
+            ValueError: ``max_coc`` is not positive and finite, or ``width`` < 1.
+
+        Example:
+            >>> lens = ThinLens(0.050, 8.0, focus_distance=2.0, sensor_width=0.036)
+            >>> round(lens.hyperfocal(max_coc=0.5, width=1920).item(), 2)
+            16.72
+        """
+        _check_sharpness(max_coc, width)
+        return self.focal_length * (1 + self.aperture_radius * (width / max_coc) / self.sensor_width)
+
+    def near_limit(self, max_coc: float, width: int) -> Tensor:
+        """Nearest depth whose CoC radius is at most ``max_coc`` pixels; see :meth:`far_limit`."""
+        return self._limit(-1, max_coc, width)
+
+    def far_limit(self, max_coc: float, width: int) -> Tensor:
+        """Farthest depth whose CoC radius is at most ``max_coc`` pixels.
+
+        ``inf`` when the lens is focused at the hyperfocal distance or beyond.
+
+        Args, result and errors are those of :meth:`hyperfocal`.
+
+        Example:
+            >>> lens = ThinLens(0.050, 8.0, focus_distance=2.0, sensor_width=0.036)
+            >>> [round(limit(0.5, 1920).item(), 3) for limit in (lens.near_limit, lens.far_limit)]
+            [1.791, 2.265]
+        """
+        return self._limit(1, max_coc, width)
+
+    def _limit(self, side: int, max_coc: float, width: int) -> Tensor:
+        _check_sharpness(max_coc, width)
+        gain, focus = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
+        return _distance((gain * focus - side * max_coc) / gain)
+
+
+class DisparityLens(Lens):
+    """A lens for maps of disparity: ``coc = strength * (focus_disparity - disparity)``.
+
+    Disparity is larger for nearer things and may have any unit and offset, as from a stereo pair or a
+    network. Here the ``depth`` of the :class:`Lens` interface is that disparity, any finite value. With
+    ``disparity = a / depth`` it is the :class:`ThinLens` with ``focus_disparity = a / df`` and
+    ``strength = E * F / (1 - F / df) * width / sensor_width / a``.
+
+    Args:
+        strength: pixels of CoC radius per unit of disparity, finite; 0 blurs nothing and a negative one
+            takes larger values as farther.
+        focus_disparity: the disparity that is in focus, finite.
+
+    Each is given and held as for :class:`ThinLens`.
+
+    Raises:
+        TypeError: not a number or floating-point tensor.
+        ValueError: not finite, or shapes or devices that do not go together.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.lens import DisparityLens
+        >>> lens = DisparityLens(strength=30.0, focus_disparity=0.5)
+        >>> lens.coc(torch.tensor([[0.0, 0.5, 1.0]]), width=1920).tolist()
+        [[15.0, 0.0, -15.0]]
+    """
+
+    strength: Tensor
+    focus_disparity: Tensor
+
+    def __init__(self, strength: float | Tensor, focus_disparity: float | Tensor) -> None:
+        super().__init__()
+        self._hold(strength=strength, focus_disparity=focus_disparity)
+        for name, value in self._values().items():
+            _check_parameter(name, value, value.isfinite(), "a finite value")
+
+    def coc(self, depth: Tensor, width: int) -> Tensor:
+        """Signed CoC radius in pixels, positive behind the disparity in focus.
+
+        Args:
+            depth: disparity, ``(B, 1, H, W)`` or ``(..., H, W)``, finite.
+            width: width of the whole image in pixels; without effect on the result.
+
+        Returns:
+            The shape of ``depth``, float32 or float64.
+
+        Raises:
+            TypeError: ``depth`` is no floating-point tensor, or ``width`` no integer.
+            ValueError: wrong shape or device, ``width`` < 1, or a disparity infinite or NaN; the values are
+                looked at as in :meth:`ThinLens.coc`.
+        """
+        disparity, strength, focus = self._align("depth", depth, width)
+        if not torch.compiler.is_compiling():
+            _check_map("depth", disparity, disparity.isfinite(), "finite disparities")
+        return strength * (focus - disparity)
+
+    def depth(self, coc: Tensor, width: int) -> Tensor:
+        """Disparity at which the signed CoC radius is ``coc``: the inverse of :meth:`coc`.
+
+        A ``strength`` of 0 has no inverse and gives infinite or NaN values.
+
+        Args:
+            coc: ``(B, 1, H, W)`` or ``(..., H, W)``, signed radius in pixels.
+            width: width of the whole image in pixels; without effect on the result.
+
+        Returns:
+            The shape of ``coc``, float32 or float64.
+
+        Raises:
+            TypeError: ``coc`` is no floating-point tensor, or ``width`` no integer.
+            ValueError: wrong shape or device, or ``width`` < 1.
+
+        Example:
+            >>> DisparityLens(30.0, focus_disparity=0.5).depth(torch.tensor([[15.0]]), width=640).item()
+            0.0
+        """
+        c, strength, focus = self._align("coc", coc, width)
+        return focus - c / strength
+
+
+def _optics(f: Tensor, n: Tensor, df: Tensor, sensor: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Pixels of CoC per dioptre of defocus, and the reciprocal focus distance: ``coc = gain * (1/df - 1/d)``.
+
+    From the usual form: ``(d - df) / d = df * (1/df - 1/d)`` and ``df / (df - F) = 1 / (1 - F/df)``.
+    """
+    focus = df.reciprocal()
+    return f * f / (2 * n) / (1 - f * focus) * width / sensor, focus
+
+
+def _distance(dioptres: Tensor) -> Tensor:
+    """Reciprocal, with inf and gradient 0 where there is no positive distance; NaN stays NaN."""
+    beyond = dioptres <= 0
+    return dioptres.masked_fill(beyond, 1).reciprocal().masked_fill(beyond, math.inf)
+
+
+def _check_width(width: int) -> None:
+    if not isinstance(width, int | torch.SymInt) or isinstance(width, bool):
+        raise TypeError(f"width: expected an integer, got {type(width).__name__}")
+    if width < 1:
+        raise ValueError(f"width: expected at least 1, got {width}")
+
+
+def _check_sharpness(max_coc: float, width: int) -> None:
+    if not isinstance(max_coc, Real) or isinstance(max_coc, bool):
+        raise TypeError(f"max_coc: expected a number, got {type(max_coc).__name__}")
+    if not 0 < max_coc < math.inf:
+        raise ValueError(f"max_coc: expected a positive finite number of pixels, got {max_coc}")
+    _check_width(width)
+
+
+def _check_parameter(name: str, value: Tensor, good: Tensor, want: str) -> None:
+    if not good.all():
+        raise ValueError(f"{name}: expected {want}, got {value[~good][0].item():g}")
+
+
+def _check_map(name: str, x: Tensor, good: Tensor, want: str) -> None:
+    """Raise unless all values are good; one bool crosses to the host."""
+    if not good.all():
+        bad = x[~good].sort().values  # NaN sorts last, so the smallest is a number where there is one
+        raise ValueError(f"{name}: expected {want}, got {len(bad)} bad of {x.numel()}, the smallest {bad[0].item():g}")
+
+
+def _show(value: Tensor) -> str:
+    if value.dim() == 0:
+        return f"{value.item():.6g}"
+    shown = [f"{v:.6g}" for v in value.detach()[:4].tolist()]
+    return f"({', '.join(shown)}{', ...' if len(value) > 4 else ''})"
