@@ -34,9 +34,7 @@ def check_image(
         raise TypeError(f"{name}: expected an integer tensor, got {x.dtype}")
     if not integer and not x.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {x.dtype}")
-    fits = x.dim() == len(shape) and all(
-        not isinstance(s, int) or s == n for s, n in zip(shape, x.shape, strict=True)
-    )
+    fits = x.dim() == len(shape) and all(not isinstance(s, int) or s == n for s, n in zip(shape, x.shape, strict=True))
     if not fits:
         raise ValueError(f"{name}: expected shape {want}, got {tuple(x.shape)}")
     if like is not None and x.device != like.device:

@@ -227,9 +227,7 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
                 high_left, high_right = _edges_at(shape, upper, high, bulge, half, middle)
                 if left_moves:
                     slope += (
-                        by_left
-                        * w
-                        * _edge_slope(r, table[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
+                        by_left * w * _edge_slope(r, table[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
                     )
                 if right_moves:
                     slope += (

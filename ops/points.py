@@ -205,7 +205,7 @@ def _splat_points_torch(
             if share.any():  # of the four corners of a whole target three get nothing
                 out.index_add_(1, cell, source * share)
     inner = slice(_MARGIN, -_MARGIN)
-    return _unflatten(out, values.new_empty(b, c, rows, columns))[..., inner, inner].contiguous()
+    return out.reshape(c, b, rows, columns)[..., inner, inner].movedim(0, 1).to(values.dtype).contiguous()
 
 
 def _gather_points_torch(
@@ -227,24 +227,25 @@ def _gather_points_torch(
     pad = (grad.shape[-1] - w) // 2
     work = working_dtype(values.device)
     g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
-    size = torch.Size((h, w))
+    every = {"values": values, "points": points, "rotation": rotation, "position": position}
+    given = {name: t for name, t in every.items() if t is not None}
+    flat = {name: t if t is points else _flatten(t).to(work) for name, t in given.items()}
 
-    def energy(flat: Tensor, table: Tensor, turn: Tensor | None, place: Tensor | None, at: tuple[Tensor, ...]) -> Tensor:
-        pixels, numbers = at
-        shares = _shares(pixels, table.index_select(0, numbers), turn, place, size, pad)
-        mass = sum(share * g.index_select(1, cell) for cell, share in shares)
-        return (flat.index_select(1, pixels) * mass).sum()
+    def energy(wanted: dict[str, Tensor], pixels: Tensor, numbers: Tensor) -> Tensor:
+        t = flat | wanted
+        here = t["points"].index_select(0, numbers)
+        shares = _shares(pixels, here, t.get("rotation"), t.get("position"), (h, w), pad)
+        mass = torch.stack([share * g.index_select(1, cell) for cell, share in shares]).sum(0)
+        return (t["values"].index_select(1, pixels) * mass).sum()
 
-    given = (values, points, rotation, position)
-    inputs = [t if t is None or t is points else _flatten(t).to(work) for t in given]
-    wanted = [k for k, t in enumerate(given) if t is not None and (geometry or k == 0)]
     # Within an operator autograd is off, whatever `torch.enable_grad` says; `torch.func` is not.
-    slopes = torch.func.grad(energy, argnums=tuple(wanted))
-    total = [torch.zeros_like(inputs[k]) for k in wanted]
-    for at in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
-        for t, dt in zip(total, slopes(*inputs, at), strict=True):
-            t += dt
-    return [t if given[k] is points else _unflatten(t, given[k]) for k, t in zip(wanted, total, strict=True)]
+    slopes = torch.func.grad(energy)
+    wanted = flat if geometry else {"values": flat["values"]}
+    total = {name: torch.zeros_like(t) for name, t in wanted.items()}
+    for piece in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
+        for name, dt in slopes(wanted, *piece).items():
+            total[name] += dt
+    return [t if name == "points" else _unflatten(t, given[name]) for name, t in total.items()]
 
 
 @torch.library.custom_op("torchbokeh::splat_points", mutates_args=())

@@ -50,7 +50,7 @@ class _Semicircle(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (t,) = ctx.saved_tensors
         return grad * (1 - t * t).clamp_min(0).sqrt()
 
@@ -100,9 +100,7 @@ def row_span(coc: Tensor, row: int, profile: Profile) -> tuple[Tensor, Tensor, T
     integrals, slopes = knot_integrals(knots), _slopes(knots)
 
     def edge_integrals(y: Tensor) -> Tensor:
-        k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(
-            0, len(knots) - 2
-        )
+        k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
         dy = (y - knots[k, 0])[:, None]
         return integrals[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
 
@@ -122,3 +120,57 @@ def clamp_radius(coc: Tensor) -> Tensor:
     """Signed CoC with its radius raised to at least ``MIN_RADIUS`` (0 counts as positive)."""
     radius = coc.abs().clamp_min(MIN_RADIUS)
     return torch.where(coc < 0, -radius, radius)
+
+
+def edges_at(profile: Profile, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Left and right edge of the unit shape at the heights ``y`` ``(N,)``, which lie between its knots."""
+    knots, bulge = profile
+    k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
+    left, right = (knots[k, 1:] + _slopes(knots)[k] * (y - knots[k, 0])[:, None]).unbind(1)
+    bottom, top = knots[0, 0], knots[-1, 0]
+    t = (2 * y - bottom - top) / (top - bottom)
+    arc = bulge * (1 - t * t).clamp_min(1e-30).sqrt()
+    return left - arc, right + arc
+
+
+def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
+    """Cut a shape into ``side * side`` pieces of equal area: sub-apertures, each with its own PSF.
+
+    Cuts run along rows, and from edge to edge at equal shares of each row, so every piece is again a stack of row
+    intervals and together they make up the shape. Curved edges become chains of ``samples`` chords.
+
+    Args:
+        profile: the whole shape.
+        side: pieces per direction; 1 gives the shape itself, with nothing lost.
+        samples: knots of each piece.
+
+    Returns:
+        The pieces, row by row. Their area is ``area(profile) / side**2``, up to 1e-4.
+
+    Raises:
+        ValueError: ``side`` is not positive.
+    """
+    if side < 1:
+        raise ValueError(f"side: expected at least 1, got {side}")
+    if side == 1:
+        return [profile]
+    bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
+    with torch.no_grad():
+        heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
+        left, right = edges_at(profile, bottom + (top - bottom) * heights)
+        share = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
+        wanted = torch.arange(1, side, dtype=share.dtype, device=share.device) / side
+        cuts = [0.0, *heights[torch.searchsorted(share / share[-1], wanted)].tolist(), 1.0]
+    pieces = []
+    for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+        # Knots crowd towards the ends, as the edge of a disc turns there.
+        t = 0.5 - 0.5 * torch.linspace(0, torch.pi, samples, dtype=heights.dtype, device=heights.device).cos()
+        y = bottom + (top - bottom) * (start + (stop - start) * t)
+        inner = profile.knots[1:-1, 0]
+        y = torch.cat([y, inner[(inner > y[0]) & (inner < y[-1])]])
+        y = y[y.detach().argsort()]
+        left, right = edges_at(profile, y)
+        for k in range(side):
+            edge = left + (right - left) * (k / side), left + (right - left) * ((k + 1) / side)
+            pieces.append(Profile(torch.stack([y, *edge], 1), torch.zeros_like(profile.bulge)))
+    return pieces

@@ -62,9 +62,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     check_image("profile.bulge", profile.bulge, (), like=values)
     dtype = compute_dtype(values, coc)
     work = working_dtype(values.device)
-    out = _splat_spans_op(
-        values.to(dtype), coc.to(dtype), profile.knots.to(work), profile.bulge.to(work), integrate
-    )
+    out = _splat_spans_op(values.to(dtype), coc.to(dtype), profile.knots.to(work), profile.bulge.to(work), integrate)
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
 
 

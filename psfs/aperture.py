@@ -36,7 +36,9 @@ class Aperture(nn.Module):
         """The unit shape in double, differentiable to the shape's parameters."""
         raise NotImplementedError
 
-    forward = profile
+    def forward(self) -> Profile:
+        """`profile`, so that the module can be called."""
+        return self.profile()
 
 
 class Ellipse(Aperture):
@@ -121,9 +123,7 @@ class Polygon(Aperture):
     rotation: Tensor
     curvature: Tensor
 
-    def __init__(
-        self, blades: int = 6, rotation: float | Tensor = 0.0, curvature: float | Tensor = 0.0
-    ) -> None:
+    def __init__(self, blades: int = 6, rotation: float | Tensor = 0.0, curvature: float | Tensor = 0.0) -> None:
         super().__init__()
         if not isinstance(blades, int) or isinstance(blades, bool):
             raise TypeError(f"blades: expected an int, got {type(blades).__name__}")

@@ -1,4 +1,7 @@
-"""torchbokeh: the look of a real camera, for PyTorch."""
+"""torchbokeh: the look of a real camera, for PyTorch.
+
+An image and its depth go in, the picture a lens would take comes out. `LensBlur` is the front door.
+"""
 
 from importlib.util import find_spec as _find_spec
 
@@ -7,3 +10,26 @@ if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None
         "torchbokeh was imported from a source folder without its parts torchbokeh.ops and torchbokeh.psfs; "
         "install it with `pip install -e .`, start Python in another folder, or use the command `torchbokeh`"
     )
+
+from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
+from torchbokeh.lens import DisparityLens, Lens, ThinLens
+from torchbokeh.lens_blur import LensBlur
+from torchbokeh.plan import Plan
+from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Aperture",
+    "DisparityLens",
+    "Disc",
+    "Ellipse",
+    "FFTIntegrator",
+    "Lens",
+    "LensBlur",
+    "Plan",
+    "Polygon",
+    "PyramidIntegrator",
+    "ScanlineIntegrator",
+    "ThinLens",
+]

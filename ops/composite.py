@@ -1,0 +1,83 @@
+"""Fill what is hidden, mix what is blurred, and put surfaces over one another.
+
+Everything here is normalised by coverage: a colour is always a weighted mean of colours, so a constant picture stays
+constant whatever the weights are, at silhouettes, between bins and at the image border.
+"""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchbokeh.ops._checks import check_image
+
+TINY = 1e-12
+"""Coverage below this counts as none; far below what one pixel of a PSF of radius 1e5 covers."""
+
+
+def pull_push(values: Tensor, weight: Tensor) -> Tensor:
+    """Fill holes smoothly from their surroundings (Gortler et al., "The Lumigraph", 1996, section 3.3.2).
+
+    Pull: the known values are averaged over ever larger blocks. Push: on the way back, what a level lacks in weight
+    is taken from the next coarser one, interpolated bilinearly.
+
+    Args:
+        values: ``(B, C, H, W)``.
+        weight: ``(B, 1, H, W)`` in [0, 1]: 1 keeps a value, 0 replaces it.
+
+    Returns:
+        ``(B, C, H, W)``, a weighted mean of known values everywhere; 0 where a whole picture has no weight.
+
+    Raises:
+        TypeError: an argument is not a floating-point tensor.
+        ValueError: shapes or devices do not fit.
+
+    Example:
+        >>> import torch
+        >>> hole = torch.ones(1, 1, 8, 8); hole[..., 2:5, 3:6] = 0
+        >>> pull_push(torch.full((1, 3, 8, 8), 0.7), hole).unique().numel()
+        1
+    """
+    b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
+    check_image("weight", weight, (b, 1, h, w), like=values)
+    levels = [(values * weight, weight)]
+    while max(levels[-1][1].shape[-2:]) > 1:
+        known, share = levels[-1]
+        odd = (0, known.shape[-1] % 2, 0, known.shape[-2] % 2)
+        known, share = (F.avg_pool2d(F.pad(t, odd), 2) * 4 for t in (known, share))
+        full = share.clamp(max=1)
+        levels.append((known * (full / share.clamp_min(TINY)), full))
+    known, share = levels.pop()
+    filled = known / share.clamp_min(TINY)
+    for known, share in reversed(levels):
+        size = known.shape[-2:]
+        up = F.interpolate(filled, scale_factor=2, mode="bilinear", align_corners=False)[..., : size[0], : size[1]]
+        filled = known + (1 - share) * up
+    return filled
+
+
+def fill_until_full(bins: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Mix the blurred bins of one surface, front to back, until a pixel is covered.
+
+    The bins are parts of one surface, so their coverages add up before they occlude: a bin counts for what the bins
+    in front of it have left free.
+
+    Args:
+        bins: pairs of a colour ``(B, C, H, W)``, weighted by coverage, and that coverage ``(B, 1, H, W)``.
+
+    Returns:
+        The mean colour ``(B, C, H, W)`` and the sum of all coverages ``(B, 1, H, W)``, which varying blur may raise
+        above 1.
+    """
+    mixed: Tensor | float = 0.0
+    taken: Tensor | float = 0.0
+    total: Tensor | float = 0.0
+    for colour, coverage in bins:
+        coverage = coverage.clamp_min(0)
+        counts = torch.minimum(coverage, (1 - taken + torch.zeros_like(coverage)).clamp_min(0))
+        mixed = mixed + colour * (counts / coverage.clamp_min(TINY))
+        taken = taken + counts
+        total = total + coverage
+    assert isinstance(taken, Tensor) and isinstance(total, Tensor)  # noqa: S101, PT018
+    return mixed / taken.clamp_min(TINY), total

@@ -1,0 +1,112 @@
+"""Splatting the slow and obvious way, in double: what `torchbokeh.ops.splat` is compared with."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.points import PointTable
+from torchbokeh.ops.spans import Profile, clamp_radius, row_span
+
+
+def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
+    """Blur with flat convex PSFs, pixel by pixel: `splat_spans(..., integrate=True)` without its differences.
+
+    Every PSF is drawn row by row; a row adds to each output pixel the length by which the two overlap, times the
+    row's weight. Takes time and memory in proportion to ``B * H * W * W`` for each of ``2 H - 1`` rows.
+
+    Args:
+        values: ``(B, C, H, W)``.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        profile: the unit shape of the PSF.
+
+    Returns:
+        ``(B, C, H, W)``, float64.
+
+    Raises:
+        TypeError: an argument is not a floating-point tensor.
+        ValueError: shapes or devices do not fit.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.ops.dense import dense_spans
+        >>> from torchbokeh.psfs import Disc
+        >>> dot = torch.zeros(1, 1, 9, 9); dot[..., 4, 4] = 1
+        >>> round(dense_spans(dot, torch.full_like(dot, 3.0), Disc().profile()).sum().item(), 6)
+        1.0
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    b, _, h, w = values.shape
+    check_image("coc", coc, (b, 1, h, w), like=values)
+    values = values.double()
+    radius = clamp_radius(coc.double().reshape(-1))
+    profile = Profile(profile.knots.double(), profile.bulge.double())
+    column = torch.arange(w, dtype=torch.float64, device=values.device)
+    out = torch.zeros_like(values)
+    for row in range(1 - h, h):
+        left, right, weight = (t.reshape(b, h, w, 1) for t in row_span(radius, row, profile))
+        start, stop = left + column[:, None], right + column[:, None]
+        overlap = torch.minimum(stop, column + 0.5) - torch.maximum(start, column - 0.5)
+        share = overlap.clamp_min(0) * weight
+        source, target = slice(max(-row, 0), min(h - row, h)), slice(max(row, 0), min(h + row, h))
+        out[:, :, target] += torch.einsum("bcyx,byxu->bcyu", values[:, :, source], share[:, source])
+    return out
+
+
+def dense_points(
+    values: Tensor,
+    index: Tensor,
+    table: PointTable,
+    pad: int,
+    rotation: Tensor | None = None,
+    position: Tensor | None = None,
+) -> Tensor:
+    """`splat_points`, point by point in plain Python: for a few pixels only.
+
+    Args:
+        values: ``(B, C, H, W)``.
+        index: ``(B, 1, H, W)`` integers, which PSF of the table each pixel takes.
+        table: the PSFs.
+        pad: width in px of the border that is added on all four sides.
+        rotation: ``(B, 2, 2, H, W)`` matrices that turn the offsets.
+        position: ``(B, 2, H, W)`` where the centre of the PSF goes, x and y in px of the unpadded image.
+
+    Returns:
+        ``(B, C, H + 2 pad, W + 2 pad)``, float64.
+
+    Raises:
+        TypeError: ``values`` is not a floating-point tensor or ``index`` not an integer one.
+        ValueError: their shapes do not fit.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.ops.dense import dense_points
+        >>> from torchbokeh.ops.points import PointTable
+        >>> table = PointTable(torch.tensor([[0.5, 0.0]]), torch.ones(1), torch.tensor([0, 1]))
+        >>> dense_points(torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=torch.int64), table, pad=1)[0, 0, 1]
+        tensor([0.0000, 0.5000, 0.5000], dtype=torch.float64)
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    b, c, h, w = values.shape
+    check_image("index", index, (b, 1, h, w), integer=True)
+    out = torch.zeros(b, c, h + 2 * pad, w + 2 * pad, dtype=torch.float64)
+    for n, y, x in torch.cartesian_prod(torch.arange(b), torch.arange(h), torch.arange(w)).tolist():
+        psf = int(index[n, 0, y, x])
+        for k in range(int(table.counts[psf]), int(table.counts[psf + 1])):
+            dx, dy = table.offsets[k].tolist()
+            u, v = (float(x), float(y)) if position is None else position[n, :, y, x].tolist()
+            if rotation is not None:
+                dx, dy = (m[0] * dx + m[1] * dy for m in rotation[n, :, :, y, x].tolist())
+            u, v = u + dx + pad, v + dy + pad
+            i, j = math.floor(u), math.floor(v)
+            f, g = u - i, v - j
+            for row, column, share in (
+                (j, i, (1 - f) * (1 - g)),
+                (j, i + 1, f * (1 - g)),
+                (j + 1, i, (1 - f) * g),
+                (j + 1, i + 1, f * g),
+            ):
+                if 0 <= row < out.shape[2] and 0 <= column < out.shape[3]:
+                    out[n, :, row, column] += values[n, :, y, x].double() * float(table.weights[k]) * share
+    return out

@@ -1,0 +1,327 @@
+import doctest
+import importlib.util
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+from torch.func import functional_call
+from torch.utils.data import DataLoader, Dataset
+
+import torchbokeh.ops.splat
+from torchbokeh.ops import _dispatch
+from torchbokeh.ops.dense import dense_spans
+from torchbokeh.ops.integrate import running_sum_x
+from torchbokeh.ops.spans import Profile
+from torchbokeh.ops.splat import PointTable, splat_points, splat_spans
+from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
+
+F32, F64 = torch.float32, torch.float64
+SHAPES = {
+    "disc": Disc(),
+    "ellipse": Ellipse(1.8, 0.5),
+    "hexagon": Polygon(6, 0.3),
+    "round blades": Polygon(5, 0.4, 0.7),
+}
+few = settings(deadline=None, max_examples=15)
+
+
+@pytest.fixture(params=SHAPES)
+def shape(request: pytest.FixtureRequest) -> Aperture:
+    return SHAPES[request.param]
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def scene(b: int, c: int, h: int, w: int, dtype: torch.dtype = F32, reach: float = 300.0) -> tuple[Tensor, Tensor]:
+    """Random values and CoC, radii of both signs from 0 up to ``reach``, evenly spread over their magnitudes."""
+    seed = torch.Generator().manual_seed(b * 1000 + c * 100 + h)
+    values = torch.rand(b, c, h, w, generator=seed, dtype=F64)
+    radius = reach ** torch.empty(b, 1, h, w, dtype=F64).uniform_(-0.3, 1, generator=seed)
+    sign = torch.randint(0, 2, radius.shape, generator=seed) * 2 - 1
+    radius = torch.where(torch.rand(radius.shape, generator=seed) < 0.05, 0.0, radius)
+    # Rounded to float32 first: tests in either dtype then see the same scene.
+    return values.float().to(dtype), (radius * sign).float().to(dtype)
+
+
+def gradients(out: Tensor, seed: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+    return torch.autograd.grad(out, inputs, seed.to(out.dtype))
+
+
+def assert_close(got: Tensor, want: Tensor, relative: float) -> None:
+    torch.testing.assert_close(got.double(), want.double(), rtol=0, atol=relative * float(want.abs().max()))
+
+
+@pytest.mark.parametrize(("dtype", "relative"), [(F32, 1e-5), (F64, 1e-10)])
+def test_equals_drawing_every_psf_densely(shape: Aperture, dtype: torch.dtype, relative: float) -> None:
+    values, coc = scene(1, 3, 24, 40, dtype)
+    want = dense_spans(values, coc, shape.profile())
+    assert_close(splat_spans(values, coc, shape.profile(), integrate=True), want, relative)
+    assert_close(running_sum_x(splat_spans(values, coc, shape.profile())), want, relative)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 17), (17, 1), (2, 3)])
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_tiny_images(shape: Aperture, dtype: torch.dtype, size: tuple[int, int]) -> None:
+    values, coc = scene(2, 2, *size, dtype, reach=10.0)
+    want = dense_spans(values, coc, shape.profile())
+    assert_close(splat_spans(values, coc, shape.profile(), integrate=True), want, 1e-5)
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_an_empty_batch(dtype: torch.dtype) -> None:
+    values = torch.zeros(0, 3, 4, 5, dtype=dtype, requires_grad=True)
+    coc = torch.zeros(0, 1, 4, 5, dtype=dtype)
+    out = splat_spans(values, coc, Disc().profile())
+    assert out.shape == values.shape
+    out.sum().backward()
+    assert values.grad is not None
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_radii_within_a_pixel_leave_the_image_as_it_is(shape: Aperture, dtype: torch.dtype) -> None:
+    values, _ = scene(1, 2, 5, 9, dtype)
+    coc = torch.linspace(-0.5, 0.5, 45, dtype=dtype).reshape(1, 1, 5, 9)
+    assert_close(splat_spans(values, coc, shape.profile(), integrate=True), values, 1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("integrate", [True, False])
+def test_the_kernel_computes_what_the_torch_definition_does(channels: int, integrate: bool, shape: Aperture) -> None:
+    values, coc = (t.requires_grad_() for t in scene(2, channels, 70, 9))
+    got = splat_spans(values, coc, shape.profile(), integrate=integrate)
+    want = splat_spans(values.double(), coc.double(), shape.profile(), integrate=integrate)
+    assert got.dtype == F32
+    assert want.dtype == F64
+    assert_close(got, want, 1e-6)
+    seed = torch.randn(got.shape, generator=torch.Generator().manual_seed(0))
+    for mine, theirs in zip(gradients(got, seed, values, coc), gradients(want, seed, values, coc), strict=True):
+        assert_close(mine, theirs, 1e-6)
+
+
+def turned(blades: int) -> Any:
+    return lambda angle: functional_call(Polygon(blades), {"rotation": angle}, ())
+
+
+def curved(curvature: Tensor) -> Profile:
+    return functional_call(Polygon(5, 0.3, 0.5), {"curvature": curvature}, ())
+
+
+def ellipse(squeeze: Tensor, rotation: Tensor) -> Profile:
+    return functional_call(Ellipse(2.0, 0.5), {"squeeze": squeeze, "rotation": rotation}, ())
+
+
+@pytest.mark.parametrize("integrate", [True, False])
+@pytest.mark.parametrize(
+    ("build", "settings"),
+    [(turned(6), [0.3]), (curved, [0.6]), (ellipse, [1.7, 0.4])],
+    ids=["turn", "curve", "ellipse"],
+)
+def test_gradients_match_finite_differences(build: Any, settings: list[float], integrate: bool) -> None:
+    values, _ = scene(1, 2, 4, 5, F64)
+    coc = torch.empty(1, 1, 4, 5, dtype=F64).uniform_(0.6, 6.0, generator=torch.Generator().manual_seed(1))
+    coc[..., ::2] *= -1
+    coc[..., 0, :2] = torch.tensor([0.2, -0.3])
+    inputs = (values, coc, *(torch.tensor(s, dtype=F64) for s in settings))
+
+    def blur(values: Tensor, coc: Tensor, *settings: Tensor) -> Tensor:
+        return splat_spans(values, coc, build(*settings), integrate=integrate)
+
+    assert torch.autograd.gradcheck(blur, [t.requires_grad_() for t in inputs])
+
+
+def test_a_trained_aperture_gets_its_gradient_in_float32() -> None:
+    values, coc = scene(1, 3, 9, 11, reach=8.0)
+    shapes = [Polygon(6, rotation=nn.Parameter(torch.tensor(0.3, dtype=t))) for t in (F32, F64)]
+    slopes = []
+    for shape, dtype in zip(shapes, (F32, F64), strict=True):
+        out = splat_spans(values.to(dtype), coc.to(dtype), shape.profile(), integrate=True)
+        (out * torch.linspace(0, 1, 11)).square().sum().backward()
+        slopes.append(float(shape.rotation.grad))
+    assert slopes[0] == pytest.approx(slopes[1], rel=1e-4)
+    assert abs(slopes[1]) > 1e-4
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_operators_keep_the_rules_of_torch(dtype: torch.dtype) -> None:
+    values, coc = (t.requires_grad_() for t in scene(1, 3, 6, 7, dtype))
+    knots, bulge = Polygon(5).profile()
+    for integrate in (True, False):
+        torch.library.opcheck(torch.ops.torchbokeh.splat_spans.default, (values, coc, knots, bulge, integrate))
+    grad = torch.rand_like(values)
+    for shape in (True, False):
+        args = (grad, values.detach(), coc.detach(), knots, bulge, shape)
+        torch.library.opcheck(torch.ops.torchbokeh.gather_spans.default, args)
+
+
+@pytest.mark.usefixtures("threads")
+def test_same_bits_for_any_number_of_threads(shape: Aperture) -> None:
+    values, coc = (t.requires_grad_() for t in scene(2, 5, 150, 12))
+    seed = torch.rand_like(values)
+    results = []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        out = splat_spans(values, coc, shape.profile(), integrate=True)
+        results.append((out, *gradients(out, seed, values, coc)))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+class Blurred(Dataset[Tensor]):
+    """Samples that are splatted where they are loaded."""
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, k: int) -> Tensor:
+        values, coc = scene(1, 3, 20 + k, 16)
+        index = (coc > 0).long()
+        table = PointTable(torch.tensor([[0.0, 0.0], [1.5, -2.0]]), torch.ones(2), torch.tensor([0, 1, 2]))
+        spans = splat_spans(values, coc, Disc().profile(), integrate=True)
+        return torch.cat([spans.flatten(), splat_points(values, index, table, pad=2).flatten()])
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
+def test_works_in_forked_workers_after_the_parent_has_used_it() -> None:
+    data = Blurred()
+    here = [data[k] for k in range(len(data))]
+    loader = DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=60)
+    there = list(loader)
+    assert len(there) == len(here)
+    assert all(torch.equal(a, b) for a, b in zip(here, there, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_linear_in_the_values(shape: Aperture, dtype: torch.dtype) -> None:
+    one, coc = scene(1, 2, 11, 13, dtype)
+    other = one.flip(-1)
+
+    def blur(values: Tensor) -> Tensor:
+        return splat_spans(values, coc, shape.profile(), integrate=True)
+
+    assert_close(blur(2 * one - 3 * other), 2 * blur(one) - 3 * blur(other), 1e-5)
+    assert torch.equal(blur(torch.zeros_like(one)), torch.zeros_like(one))
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("integrate", [True, False])
+def test_backward_is_the_adjoint(shape: Aperture, dtype: torch.dtype, integrate: bool) -> None:
+    values, coc = scene(2, 3, 12, 14, dtype)
+    seed = torch.randn(values.shape, generator=torch.Generator().manual_seed(5)).to(dtype)
+    out = splat_spans(values.requires_grad_(), coc, shape.profile(), integrate=integrate)
+    (back,) = gradients(out, seed, values)
+    forwards, backwards = (out.double() * seed).sum(), (values.double() * back).sum()
+    assert float(forwards) == pytest.approx(float(backwards), rel=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_a_batch_equals_its_images_one_by_one(dtype: torch.dtype) -> None:
+    values, coc = scene(3, 5, 12, 14, dtype)
+    profile = Polygon(7).profile()
+    together = splat_spans(values, coc, profile)
+    for n in range(3):
+        assert torch.equal(together[n : n + 1], splat_spans(values[n : n + 1], coc[n : n + 1], profile))
+
+
+@given(radius=st.floats(0, 13), name=st.sampled_from(list(SHAPES)), double=st.booleans(), front=st.booleans())
+@few
+def test_energy_is_conserved_within_the_image(radius: float, name: str, double: bool, front: bool) -> None:
+    dot = torch.zeros(1, 1, 29, 29, dtype=F64 if double else F32)
+    dot[..., 14, 14] = 3
+    coc = torch.full_like(dot, -radius if front else radius)
+    out = splat_spans(dot, coc, SHAPES[name].profile(), integrate=True)
+    assert float(out.double().sum()) == pytest.approx(3, rel=1e-5)
+    assert float(out.min()) > -1e-6
+
+
+def test_a_psf_beyond_the_image_is_flat() -> None:
+    dot = torch.zeros(1, 1, 8, 8)
+    dot[..., 3, 4] = 1
+    out = splat_spans(dot, torch.full_like(dot, 1e4), Disc().profile(), integrate=True)
+    assert_close(out, torch.full_like(out, 1 / (math.pi * 1e8)), 1e-6)
+
+
+@pytest.mark.parametrize("radius", [0.0, 3.3, 20.0])
+def test_a_highlight_leaves_no_trace_on_its_rows(shape: Aperture, radius: float) -> None:
+    dot = torch.zeros(1, 4, 9, 300)
+    dot[..., 4, 40] = 1e6
+    out = splat_spans(dot, torch.full((1, 1, 9, 300), radius), shape.profile(), integrate=True)
+    assert float(out[..., 65:].abs().max()) < 1e-6 * float(out.max())
+    # What is left is rounding of the row's own ends: it does not grow along the row.
+    assert float((out[..., -1] - out[..., 65]).abs().max()) < 1e-7 * float(out.max())
+
+
+def test_bad_input_is_named() -> None:
+    values, coc = scene(2, 3, 4, 5)
+    profile = Disc().profile()
+    with pytest.raises(TypeError, match=r"values: expected a tensor of shape \(B, C, H, W\), got list"):
+        splat_spans([1.0], coc, profile)
+    with pytest.raises(ValueError, match=r"values: expected shape \(B, C, H, W\), got \(3, 4, 5\)"):
+        splat_spans(values[0], coc, profile)
+    with pytest.raises(TypeError, match=r"values: expected a floating-point tensor, got torch.int64"):
+        splat_spans(values.long(), coc, profile)
+    with pytest.raises(ValueError, match=r"coc: expected shape \(2, 1, 4, 5\), got \(2, 2, 4, 5\)"):
+        splat_spans(values, coc.expand(2, 2, 4, 5), profile)
+    with pytest.raises(ValueError, match=r"coc: expected device cpu, got meta"):
+        splat_spans(values, coc.to("meta"), profile)
+    with pytest.raises(ValueError, match=r"profile.knots: expected shape \(K, 3\), got \(2, 2\)"):
+        splat_spans(values, coc, Profile(profile.knots[:, :2], profile.bulge))
+    with pytest.raises(ValueError, match=r"profile.bulge: expected shape \(\), got \(1,\)"):
+        splat_spans(values, coc, Profile(profile.knots, profile.bulge[None]))
+
+
+@pytest.mark.parametrize(("dtype", "relative"), [(torch.float16, 1e-3), (torch.bfloat16, 1e-2)])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype, relative: float) -> None:
+    values, coc = scene(1, 3, 12, 14, dtype, reach=8.0)
+    out = splat_spans(values.requires_grad_(), coc, Disc().profile(), integrate=True)
+    assert out.dtype == dtype
+    assert_close(out, splat_spans(values.float(), coc.float(), Disc().profile(), integrate=True), relative)
+    out.float().sum().backward()
+    assert values.grad is not None
+    assert values.grad.dtype == dtype
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+def test_the_memory_layout_does_not_matter(dtype: torch.dtype) -> None:
+    values, coc = scene(2, 3, 12, 14, dtype, reach=8.0)
+    want = splat_spans(values, coc, Disc().profile())
+    strided = [t.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2) for t in (values, coc)]
+    widened = [torch.stack([t, t + 1], -1)[..., 0] for t in (values, coc)]
+    for v, r in (strided, widened):
+        assert not v.is_contiguous()
+        v.requires_grad_()
+        out = splat_spans(v, r, Disc().profile())
+        assert torch.equal(out, want)
+        assert gradients(out, torch.ones_like(want).permute(0, 1, 3, 2).contiguous().mT, v)[0].isfinite().all()
+    flat = torch.full((), 3.0, dtype=dtype).expand(2, 1, 12, 14)
+    assert torch.equal(splat_spans(values, flat, Disc().profile()), splat_spans(values, flat.clone(), Disc().profile()))
+
+
+def test_without_numba_the_torch_path_takes_over_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    values, coc = scene(1, 3, 12, 14)
+    profile = Disc().profile()
+    want = splat_spans(values, coc, profile)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "numba" else find(name, *a))
+    monkeypatch.setitem(torchbokeh.ops.__dict__, "_span_kernels", None)
+    _dispatch.numba_is_there.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match=r"numba is not installed.*pip install torchbokeh\[cpu\]"):
+            assert_close(splat_spans(values, coc, profile), want, 1e-6)
+        splat_spans(values, coc, profile)  # a second warning would be an error
+    finally:
+        monkeypatch.undo()
+        _dispatch.numba_is_there.cache_clear()
+
+
+def test_examples() -> None:
+    assert doctest.testmod(torchbokeh.ops.splat).failed == 0

@@ -1,0 +1,152 @@
+"""From an image with depth to surfaces that are blurred and put over one another.
+
+A *surface* is something with one depth per pixel: the picture itself, what stands in front of the focus plane, what
+lies behind that, or a layer of the caller's. Each is blurred in soft bins of constant parallax (uniform in the signed
+circle of confusion), and all are composed front to back, once for every sub-aperture of the lens.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchbokeh.ops.composite import TINY, fill_until_full, pull_push
+from torchbokeh.ops.spans import Profile, area
+from torchbokeh.ops.splat import splat_spans
+
+FOREGROUND = (-2.0, -1.0)
+"""Signed CoC (px) between which a pixel passes from foreground to rest. What is sharper hides nothing."""
+
+SPACING = 6.0
+"""Distance of the bins in px of CoC. Closer ones change the picture little: what counts is what hides what."""
+
+CERTAIN = 4.0
+"""Views of a surface that splats cover to one over this count fully: splats of varying blur thin out, holes do not."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Something with one depth per pixel.
+
+    Attributes:
+        colour: ``(B, C, H, W)``, premultiplied by ``alpha`` where there is one.
+        alpha: coverage ``(B, 1, H, W)`` in [0, 1]; ``None`` means opaque everywhere.
+        coc: ``(B, 1, H, W)`` signed radius in px, continued to where ``alpha`` is 0.
+        centres: centres of its bins in px of CoC, front to back.
+    """
+
+    colour: Tensor
+    alpha: Tensor | None
+    coc: Tensor
+    centres: tuple[float, ...]
+
+
+def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
+    """Evenly spaced bins for CoCs from ``low`` to ``high`` px, about `SPACING` apart and at most ``most``."""
+    count = 1 if high - low <= 1 else min(most, 1 + math.ceil((high - low) / SPACING))
+    if count == 1:
+        return (0.5 * (low + high),)
+    return tuple(low + (high - low) * k / (count - 1) for k in range(count))
+
+
+def bin_weights(coc: Tensor, centres: Sequence[float]) -> list[Tensor]:
+    """Share of every pixel in every bin: a hat over the two nearest centres. The shares of a pixel sum to 1."""
+    if len(centres) == 1:
+        return [torch.ones_like(coc)]
+    place = (coc - centres[0]) / (centres[1] - centres[0])
+    place = place.clamp(0, len(centres) - 1)
+    return [(1 - (place - k).abs()).clamp_min(0) for k in range(len(centres))]
+
+
+def split_foreground(
+    image: Tensor, coc: Tensor, behind: tuple[Tensor, Tensor | None] | None, centres: Sequence[tuple[float, ...]]
+) -> list[Surface]:
+    """What stands in front of the focus plane, and the rest with the hidden part filled in.
+
+    The rest is taken from ``behind`` where the foreground hides it, or from its surroundings by pull-push, in colour
+    and in CoC. Pixels beside the foreground are replaced as well, since they hold some of its colour.
+
+    Args:
+        image: ``(B, C, H, W)``.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        behind: what the foreground hides, as colour and CoC; ``None`` for what is not known.
+        centres: bins of the foreground and of the rest.
+    """
+    start, stop = FOREGROUND
+    front = ((stop - coc) / (stop - start)).clamp(0, 1)
+    known = 1 - F.max_pool2d(front, 3, 1, 1)
+    colour, behind_coc = (None, None) if behind is None else behind
+    filled = pull_push(torch.cat([image, coc], 1), known)
+    rest = filled[:, :-1] if colour is None else image * known + colour * (1 - known)
+    rest_coc = filled[:, -1:] if behind_coc is None else coc * known + behind_coc * (1 - known)
+    return [
+        Surface(image * front, front, continued(coc, front), centres[0]),
+        Surface(rest, None, rest_coc, centres[1]),
+    ]
+
+
+def continued(coc: Tensor, alpha: Tensor) -> Tensor:
+    """The CoC of a surface, continued from its surroundings to where the surface is not."""
+    here = (alpha > 0).to(coc.dtype)
+    return torch.where(here > 0, coc, pull_push(torch.where(here > 0, coc, 0.0), here))
+
+
+def blurred(surface: Surface, profile: Profile) -> tuple[Tensor, Tensor, Tensor]:
+    """One surface through one sub-aperture.
+
+    Returns:
+        The mean colour ``(B, C, H, W)``, the share ``(B, 1, H, W)`` of the light that the surface stops, and how much
+        of it the picture knows: less than 1 where it would reach in from outside or from behind something else.
+    """
+    c = surface.colour.shape[1]
+    opaque = surface.alpha is None
+    alpha = torch.ones_like(surface.coc) if surface.alpha is None else surface.alpha
+    source = torch.cat([surface.colour, alpha], 1)
+
+    def bins() -> list[tuple[Tensor, Tensor]]:
+        out = []
+        for weight in bin_weights(surface.coc, surface.centres):
+            splat = splat_spans(source * weight, surface.coc, profile, integrate=True)
+            out.append((splat[:, :c], splat[:, c:]))
+        return out
+
+    colour, coverage = fill_until_full(bins())
+    if opaque:
+        return colour, torch.ones_like(coverage), (CERTAIN * coverage).clamp(max=1)
+    # Where blur varies, splats crowd or thin out. The same splats of a surface without holes say by how much.
+    whole = splat_spans(torch.ones_like(alpha), surface.coc, profile, integrate=True)
+    return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), (CERTAIN * whole).clamp(0, 1)
+
+
+def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Tensor, Tensor]:
+    """Blur all surfaces and put them over one another, front to back, for every sub-aperture.
+
+    Through one small piece of the lens, what is in front covers what is behind almost as in a pinhole picture; the
+    mean over the pieces keeps the relation of coverage to lens position that one "over" of fully blurred surfaces
+    loses. A part of the view that nothing is known of, beyond the border or behind an edge, gets no vote.
+
+    Args:
+        surfaces: front to back.
+        pieces: the sub-apertures, see `torchbokeh.ops.spans.subdivide`.
+
+    Returns:
+        Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``, 1 where something opaque is behind.
+    """
+    colour: Tensor | float = 0.0
+    covered: Tensor | float = 0.0
+    known: Tensor | float = 0.0
+    for profile in pieces:
+        size = area(profile).to(surfaces[0].coc.dtype)
+        left = torch.ones_like(surfaces[0].coc)
+        for surface in surfaces:
+            mean, stopped, share = blurred(surface, profile)
+            vote = size * left * stopped * share
+            colour = colour + vote * mean
+            covered = covered + vote
+            left = left * (1 - stopped)
+        known = known + size * left * share
+    total = (covered + known + torch.zeros_like(surfaces[0].coc)).clamp_min(TINY)
+    return colour / total, covered / total

@@ -1,0 +1,255 @@
+"""The front door: image and depth in, the picture a lens would take out."""
+
+import torch
+from torch import Tensor, nn
+
+from torchbokeh.layers import FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
+from torchbokeh.lens import Lens
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.spans import MIN_RADIUS, subdivide
+from torchbokeh.plan import Hidden, Plan
+from torchbokeh.psfs.aperture import Aperture, parse_aperture
+
+Background = Tensor | tuple[Tensor, Tensor] | None
+
+MOST_BINS = 8
+"""Soft bins of a surface where ``layers="auto"``."""
+
+
+class LensBlur(nn.Module):
+    """Depth of field, exact: every pixel spreads over its circle of confusion, near surfaces cover far ones.
+
+    A first look at the scene makes a `Plan` of what it needs; only that is done. A plain image is split into what
+    stands in front of the focus plane and the rest, whose hidden part is filled in or given by the caller. Input in
+    layers is taken as it is. Every surface is splatted (`torchbokeh.ops.splat.splat_spans`) and composed front to
+    back (`torchbokeh.layers.compose`), normalised by coverage: a constant image stays constant.
+
+    Args:
+        lens: turns depth into signed CoC; may be left out if ``coc=`` is passed to every call.
+        aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
+        layers: most soft bins of constant parallax per surface, or ``"auto"``.
+        quality: ``"exact"``.
+        max_coc: largest radius in px; larger ones are cut to it. ``None``: no limit.
+        subapertures: the lens is cut into ``subapertures**2`` pieces that are composed one by one, which keeps the
+            relation of coverage and lens position where blurred surfaces overlap. ``"auto"``: 3 where all that is
+            hidden is known, 2 where it is guessed, 1 where nothing hides anything.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a value out of its range.
+
+    Example:
+        >>> import torch
+        >>> import torchbokeh as tb
+        >>> blur = tb.LensBlur(tb.ThinLens(0.050, 1.8, focus_distance=2.0, sensor_width=0.036))
+        >>> image, depth = torch.rand(1, 3, 32, 48), torch.full((1, 1, 32, 48), 5.0)
+        >>> blur(image, depth).shape
+        torch.Size([1, 3, 32, 48])
+    """
+
+    def __init__(
+        self,
+        lens: Lens | None = None,
+        aperture: str | Aperture = "disc",
+        layers: int | str = "auto",
+        quality: str = "exact",
+        *,
+        max_coc: float | None = None,
+        subapertures: int | str = "auto",
+    ) -> None:
+        super().__init__()
+        if lens is not None and not isinstance(lens, Lens):
+            raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
+        if quality != "exact":
+            raise ValueError(f"quality: expected 'exact', got {quality!r}")
+        if max_coc is not None and not max_coc > 0:
+            raise ValueError(f"max_coc: expected a radius in px above 0, got {max_coc}")
+        self.lens = lens
+        self.aperture = parse_aperture(aperture)
+        self.layers = _count("layers", layers)
+        self.quality = quality
+        self.max_coc = max_coc
+        self.subapertures = _count("subapertures", subapertures)
+
+    def extra_repr(self) -> str:
+        """The settings, for ``print``."""
+        return (
+            f"layers={self.layers or 'auto'}, quality={self.quality!r}, max_coc={self.max_coc}, "
+            f"subapertures={self.subapertures or 'auto'}"
+        )
+
+    def plan(
+        self,
+        image: Tensor,
+        depth: Tensor | None = None,
+        *,
+        coc: Tensor | None = None,
+        background: Background = None,
+    ) -> Plan:
+        """Look at a scene once and say what it needs. Arguments are those of `forward`.
+
+        One small copy from the device; with ``plan=`` a forward pass makes none, and its shapes are static.
+        """
+        _, signed, cut = self._inputs(image, depth, coc, background)
+        with torch.no_grad():
+            if image.numel() == 0:
+                raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
+            if image.dim() == 5:
+                return self._plan_layers(image, signed, cut)
+            *_, height, width = image.shape
+            low, high, clamped = torch.stack([*signed.aminmax(), cut.to(signed.dtype).mean()]).tolist()
+            start, stop = FOREGROUND
+            most = self.layers or MOST_BINS
+            in_front = low < stop and high > start and high - low > 1
+            hidden: Hidden = "nothing"
+            if in_front:
+                bins = bin_centres(low, stop, most), bin_centres(start, high, most)
+                hidden = "filled" if background is None else "given"
+            else:
+                bins = (bin_centres(low, high, most),)
+            occludes = in_front or len(bins[0]) > 1
+            return self._finish((height, width), (low, high), clamped, (), hidden, bins, occludes)
+
+    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor) -> Plan:
+        *_, height, width = image.shape
+        held = image[:, :, 3:] > 0
+        low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
+        high = torch.where(held, signed, -torch.inf).movedim(1, 0).flatten(1).amax(1)
+        share = (cut & held).sum() / held.sum().clamp_min(1)
+        *bounds, clamped = torch.cat([low, high, share[None].to(low.dtype)]).tolist()
+        count = image.shape[1]
+        kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
+        most = self.layers or MOST_BINS
+        bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
+        span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
+        occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
+        return self._finish((height, width), span, clamped, kept, "layers", bins, occludes)
+
+    def _finish(
+        self,
+        size: tuple[int, int],
+        span: tuple[float, float],
+        clamped: float,
+        kept: tuple[int, ...],
+        hidden: Hidden,
+        bins: tuple[tuple[float, ...], ...],
+        occludes: bool,
+    ) -> Plan:
+        largest = max(abs(span[0]), abs(span[1]))
+        if self.subapertures is not None:
+            pieces = self.subapertures
+        elif not occludes or largest < 3:
+            pieces = 1
+        else:
+            pieces = 3 if hidden in ("given", "layers") else 2
+        sharp = largest <= MIN_RADIUS and hidden != "layers"
+        return Plan(size, span, clamped, sharp, kept, hidden, bins, pieces, repr(self.aperture))
+
+    def forward(
+        self,
+        image: Tensor,
+        depth: Tensor | None = None,
+        *,
+        coc: Tensor | None = None,
+        background: Background = None,
+        plan: Plan | None = None,
+    ) -> Tensor:
+        """Blur a picture.
+
+        Args:
+            image: ``(B, C, H, W)`` linear radiance, any number of channels; or layers ``(B, L, 4, H, W)`` of
+                premultiplied RGBA, front to back.
+            depth: ``(B, 1, H, W)``, or ``(B, L, 1, H, W)`` for layers: metres (``inf`` is sky) for a `ThinLens`,
+                disparity for a `DisparityLens`.
+            coc: signed CoC radius in px, in the place of ``depth``.
+            background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
+                its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
+            plan: a plan made earlier with `plan`; the scene is then not looked at again.
+
+        Returns:
+            ``(B, C, H, W)``; for layers ``(B, 4, H, W)``, premultiplied.
+
+        Raises:
+            TypeError: an argument is not a floating-point tensor, or not a `Plan`.
+            ValueError: shapes, devices or values do not fit: see the message.
+        """
+        behind, signed, _ = self._inputs(image, depth, coc, background)
+        if image.numel() == 0:
+            return image.clone() if image.dim() == 4 else image.sum(1)
+        if plan is None:
+            plan = self.plan(image, depth, coc=coc, background=background)
+        self._check_plan(plan, image, background)
+        if plan.sharp and not signed.requires_grad:
+            return image.clone()
+        dtype = torch.promote_types(signed.dtype, image.dtype)
+        with torch.autocast(image.device.type, enabled=False):
+            pieces = subdivide(self.aperture.profile(), plan.subapertures)
+            source, radii = image.to(dtype), signed.to(dtype)
+            if image.dim() == 5:
+                surfaces = [
+                    Surface(source[:, k, :3], source[:, k, 3:], continued(radii[:, k], source[:, k, 3:]), bins)
+                    for k, bins in zip(plan.layers, plan.bins, strict=True)
+                ]
+                out = torch.cat(compose(surfaces, pieces), 1) if surfaces else torch.zeros_like(source[:, 0])
+            elif len(plan.bins) == 2:
+                out, _ = compose(split_foreground(source, radii, behind, plan.bins), pieces)
+            else:
+                out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces)
+        return out.to(image.dtype)
+
+    def _inputs(
+        self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background
+    ) -> tuple[tuple[Tensor, Tensor | None] | None, Tensor, Tensor]:
+        """Check everything; return the background with its CoC, the signed CoC, and where ``max_coc`` cut it."""
+        layered = isinstance(image, Tensor) and image.dim() == 5
+        check_image("image", image, ("B", "L", 4, "H", "W") if layered else ("B", "C", "H", "W"))
+        if (depth is None) == (coc is None):
+            raise ValueError("depth: expected either depth or coc, got " + ("both" if coc is not None else "neither"))
+        name, value = ("depth", depth) if coc is None else ("coc", coc)
+        signed = self._signed(name, value, image, is_coc=coc is not None)
+        limit = self.max_coc
+        cut = torch.zeros_like(signed, dtype=torch.bool) if limit is None else signed.abs() > limit
+        signed = signed if limit is None else signed.clamp(-limit, limit)
+        if background is None:
+            return None, signed, cut
+        if layered:
+            raise ValueError("background: expected None for layers (make it the last layer), got a background")
+        colour, behind = background if isinstance(background, tuple) else (background, None)
+        check_image("background", colour, tuple(image.shape), like=image)
+        if behind is not None:
+            behind = self._signed("background[1]", behind, image, is_coc=coc is not None)
+            behind = behind if limit is None else behind.clamp(-limit, limit)
+        return (colour, behind), signed, cut
+
+    def _signed(self, name: str, value: Tensor | None, image: Tensor, *, is_coc: bool) -> Tensor:
+        """The signed CoC of a map of depth or of CoC."""
+        checked = check_image(name, value, (*image.shape[:-3], 1, *image.shape[-2:]), like=image)
+        if not is_coc:
+            if self.lens is None:
+                raise ValueError(f"{name}: expected coc, since this LensBlur has no lens, got depth")
+            return self.lens.coc(checked, image.shape[-1])
+        if not torch.compiler.is_compiling() and not bool(checked.isfinite().all()):
+            raise ValueError(f"{name}: expected finite radii, got {int((~checked.isfinite()).sum())} that are not")
+        return checked
+
+    @staticmethod
+    def _check_plan(plan: Plan, image: Tensor, background: Background) -> None:
+        if not isinstance(plan, Plan):
+            raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
+        if plan.size != tuple(image.shape[-2:]):
+            raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
+        if (plan.hidden == "layers") != (image.dim() == 5) or any(k >= image.shape[1] for k in plan.layers):
+            raise ValueError(f"plan: expected one for an image of shape {tuple(image.shape)}, got one for other layers")
+        if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (background is not None):
+            raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
+
+
+def _count(name: str, value: int | str) -> int | None:
+    """A positive number, or ``None`` for ``"auto"``."""
+    if value == "auto":
+        return None
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected an int or 'auto', got {value!r}")
+    if value < 1:
+        raise ValueError(f"{name}: expected at least 1, got {value}")
+    return value

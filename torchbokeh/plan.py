@@ -1,0 +1,62 @@
+"""What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Hidden = Literal["nothing", "filled", "given", "layers"]
+
+_HIDDEN = {
+    "filled": "what it hides is filled from its surroundings (pass background= if you know it)",
+    "given": "what it hides comes from background=",
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a scene needs, and by that what is left out.
+
+    Attributes:
+        size: ``(H, W)`` of the image.
+        coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
+        clamped: share of the pixels whose radius ``max_coc`` cut.
+        sharp: every radius is below half a pixel: the image passes through.
+        layers: indices of the input layers that hold anything; ``()`` for a plain image.
+        hidden: how what the foreground hides is known.
+        bins: for every surface, front to back, the centres of its soft bins in px of CoC.
+        subapertures: the lens is cut into the square of this many pieces.
+        aperture: the shape of the aperture, for the reader.
+    """
+
+    size: tuple[int, int]
+    coc_range: tuple[float, float]
+    clamped: float
+    sharp: bool
+    layers: tuple[int, ...]
+    hidden: Hidden
+    bins: tuple[tuple[float, ...], ...]
+    subapertures: int
+    aperture: str
+
+    def __str__(self) -> str:
+        height, width = self.size
+        low, high = self.coc_range
+        head = f"{width} x {height} image, CoC {low:+.1f} to {high:+.1f} px (negative: in front of the focus plane)."
+        if self.sharp:
+            return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        lines = [head]
+        counts = " and ".join(str(len(b)) for b in self.bins)
+        if self.layers:
+            lines.append(
+                f"{len(self.bins)} layers of the input are blurred ({counts} bins) and composed front to back."
+            )
+        elif len(self.bins) == 2:
+            lines.append(f"The foreground is blurred over the rest ({counts} bins); {_HIDDEN[self.hidden]}.")
+        else:
+            lines.append(f"One surface in {counts} bin{'s' if len(self.bins[0]) > 1 else ''}: no foreground is needed.")
+        if self.subapertures > 1:
+            lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
+        else:
+            lines.append(f"{self.aperture}, whole: nothing hides anything, or the blur is too small to show it.")
+        if self.clamped:
+            lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
+        return "\n".join(lines)
