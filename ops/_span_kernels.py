@@ -39,14 +39,14 @@ def _semicircle(t):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _row_table(r, first, n, shape, bulge, inv_area, table):  # type: ignore[no-untyped-def]
-    """Fill ``table[:3, :n]`` with left, right, weight of rows ``first .. first+n-1`` for radius ``r``.
+def _row_table(r, first, n, shapes, s, bulge, inv_area, left, right, weight, arcs):  # type: ignore[no-untyped-def]
+    """Fill ``left``, ``right``, ``weight`` for the rows ``first .. first+n-1`` of a PSF of radius ``r``.
 
-    ``shape`` is ``(K, 7)``: y, left, right, integral of left, integral of right, slope of left and right.
-    ``table[3, :n+1]`` is scratch.
+    ``shapes[s]`` is ``(K, 7)``: y, left, right, integral of left, integral of right, slope of left and right.
+    ``arcs`` is scratch, one longer than the others.
     """
-    knots = len(shape)
-    bottom, top = shape[0, 0], shape[knots - 1, 0]
+    knots = shapes.shape[1]
+    bottom, top = shapes[s, 0, 0], shapes[s, knots - 1, 0]
     inv = 1.0 / r
     scale = inv * inv_area
     if bulge > 0.0:
@@ -55,41 +55,41 @@ def _row_table(r, first, n, shape, bulge, inv_area, table):  # type: ignore[no-u
         half = 0.5 * (top - bottom)
         step = inv / half
         start = (first - 0.5) * step - 0.5 * (top + bottom) / half
-        centre = 0.5 * r * (shape[0, 1] + shape[1, 1])
-        shear = 0.5 * r * shape[0, 5] * half
+        centre = 0.5 * r * (shapes[s, 0, 1] + shapes[s, 1, 1])
+        shear = 0.5 * r * shapes[s, 0, 5] * half
         width = r * bulge
         scale *= half
         for k in range(n + 1):
-            table[3, k] = _semicircle(start + k * step)
+            arcs[k] = _semicircle(start + k * step)
         for k in range(n):
             low = max(start + k * step, -1.0)
             high = min(start + (k + 1) * step, 1.0)
             height = high - low
-            arc = width * (table[3, k + 1] - table[3, k]) / max(height, 1e-12)
+            arc = width * (arcs[k + 1] - arcs[k]) / max(height, 1e-12)
             middle = centre + shear * (low + high)
-            table[0, k] = middle - arc
-            table[1, k] = middle + arc
-            table[2, k] = max(height, 0.0) * scale
+            left[k] = middle - arc
+            right[k] = middle + arc
+            weight[k] = max(height, 0.0) * scale
         return
     piece = 0
     low = min(max((first - 0.5) * inv, bottom), top)
-    while piece < knots - 2 and shape[piece + 1, 0] <= low:
+    while piece < knots - 2 and shapes[s, piece + 1, 0] <= low:
         piece += 1
-    dy = low - shape[piece, 0]
-    old_left = shape[piece, 3] + dy * (shape[piece, 1] + 0.5 * shape[piece, 5] * dy)
-    old_right = shape[piece, 4] + dy * (shape[piece, 2] + 0.5 * shape[piece, 6] * dy)
+    dy = low - shapes[s, piece, 0]
+    old_left = shapes[s, piece, 3] + dy * (shapes[s, piece, 1] + 0.5 * shapes[s, piece, 5] * dy)
+    old_right = shapes[s, piece, 4] + dy * (shapes[s, piece, 2] + 0.5 * shapes[s, piece, 6] * dy)
     for k in range(n):
         high = min(max((first + k + 0.5) * inv, bottom), top)
-        while piece < knots - 2 and shape[piece + 1, 0] <= high:
+        while piece < knots - 2 and shapes[s, piece + 1, 0] <= high:
             piece += 1
-        dy = high - shape[piece, 0]
-        new_left = shape[piece, 3] + dy * (shape[piece, 1] + 0.5 * shape[piece, 5] * dy)
-        new_right = shape[piece, 4] + dy * (shape[piece, 2] + 0.5 * shape[piece, 6] * dy)
+        dy = high - shapes[s, piece, 0]
+        new_left = shapes[s, piece, 3] + dy * (shapes[s, piece, 1] + 0.5 * shapes[s, piece, 5] * dy)
+        new_right = shapes[s, piece, 4] + dy * (shapes[s, piece, 2] + 0.5 * shapes[s, piece, 6] * dy)
         height = high - low
         safe = max(height, 1e-12)
-        table[0, k] = r * (new_left - old_left) / safe
-        table[1, k] = r * (new_right - old_right) / safe
-        table[2, k] = height * scale
+        left[k] = r * (new_left - old_left) / safe
+        right[k] = r * (new_right - old_right) / safe
+        weight[k] = height * scale
         low, old_left, old_right = high, new_left, new_right
 
 
@@ -107,7 +107,8 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
     height, width = coc.shape
     stride = 4 * (width + 2)
     band = np.zeros((y1 - y0) * stride, np.float64)
-    table = np.empty((4, y1 - y0 + 1), np.float64)
+    lefts = np.empty(y1 - y0, np.float64)
+    rights, weights, arcs = np.empty_like(lefts), np.empty_like(lefts), np.empty(y1 - y0 + 1, np.float64)
     right_border = np.float64(width)
     for y in range(height):
         if y + reach[y] + 1.0 < y0 or y - reach[y] - 1.0 > y1:
@@ -117,18 +118,18 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
             if src[p] == 0.0 and src[p + 1] == 0.0 and src[p + 2] == 0.0 and src[p + 3] == 0.0:
                 continue
             c = np.float64(coc[y, x])
-            shape = shapes[1] if c < 0.0 else shapes[0]
+            s = 1 if c < 0.0 else 0
             r = max(abs(c), MIN_RADIUS)
-            first, n = _row_range(r, y, shape[0, 0], shape[-1, 0], y0, y1)
+            first, n = _row_range(r, y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
             if n <= 0:
                 continue
-            _row_table(r, first, n, shape, bulge, inv_area, table)
+            _row_table(r, first, n, shapes, s, bulge, inv_area, lefts, rights, weights, arcs)
             o = (y + first - y0) * stride
             for k in range(n):
                 # What starts left of the image starts at its border; what ends right of it never ends.
-                left = min(max(x + 0.5 + table[0, k], 0.0), right_border)
-                right = min(max(x + 0.5 + table[1, k], 0.0), right_border)
-                w = table[2, k]
+                left = min(max(x + 0.5 + lefts[k], 0.0), right_border)
+                right = min(max(x + 0.5 + rights[k], 0.0), right_border)
+                w = weights[k]
                 i = int(left)
                 f = left - i
                 add_pair(band, o + 4 * i, src, p, np.float32(w * (1.0 - f)), np.float32(w * f))
@@ -158,12 +159,12 @@ def _edge_slope(r, mean, low, high, at_low, at_high, d_low, d_high):  # type: ig
 
 
 @nb.njit(inline="always")
-def _edges_at(shape, piece, y, bulge, half, middle):  # type: ignore[no-untyped-def]
+def _edges_at(shapes, s, piece, y, bulge, half, middle):  # type: ignore[no-untyped-def]
     """Left and right edge of the unit shape at height ``y``, which lies in piece ``piece``."""
-    dy = y - shape[piece, 0]
+    dy = y - shapes[s, piece, 0]
     t = (y - middle) / half
     arc = bulge * math.sqrt(max(1.0 - t * t, 0.0))
-    return shape[piece, 1] + shape[piece, 5] * dy - arc, shape[piece, 2] + shape[piece, 6] * dy + arc
+    return shapes[s, piece, 1] + shapes[s, piece, 5] * dy - arc, shapes[s, piece, 2] + shapes[s, piece, 6] * dy + arc
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -173,7 +174,9 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
     ``grad (H, W+2, 4)`` is the gradient of the differences. Adds to ``grad_src (H*W*4)``, ``grad_coc (H, W)``.
     """
     height, width = coc.shape
-    table = np.empty((4, height + 1), np.float64)
+    knots = shapes.shape[1]
+    lefts = np.empty(height, np.float64)
+    rights, weights, arcs = np.empty_like(lefts), np.empty_like(lefts), np.empty(height + 1, np.float64)
     right_border = np.float64(width)
     pixel = np.empty(4, np.float64)
     total = np.empty(4, np.float64)
@@ -181,12 +184,12 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
         for x in range(width):
             p = 4 * (y * width + x)
             c = np.float64(coc[y, x])
-            shape = shapes[1] if c < 0.0 else shapes[0]
+            s = 1 if c < 0.0 else 0
             r = max(abs(c), MIN_RADIUS)
-            bottom, top = shape[0, 0], shape[-1, 0]
+            bottom, top = shapes[s, 0, 0], shapes[s, -1, 0]
             half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
             first, n = _row_range(r, y, bottom, top, 0, height)
-            _row_table(r, first, n, shape, bulge, inv_area, table)
+            _row_table(r, first, n, shapes, s, bulge, inv_area, lefts, rights, weights, arcs)
             for k in range(4):
                 pixel[k] = src[p + k]
                 total[k] = 0.0
@@ -194,9 +197,9 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
             piece = 0
             inv = 1.0 / r
             for k in range(n):
-                w = table[2, k]
-                left = x + 0.5 + table[0, k]
-                right = x + 0.5 + table[1, k]
+                w = weights[k]
+                left = x + 0.5 + lefts[k]
+                right = x + 0.5 + rights[k]
                 left_moves = 0.0 < left < right_border
                 right_moves = 0.0 < right < right_border
                 left = min(max(left, 0.0), right_border)
@@ -218,22 +221,22 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
                 d_low = -low * inv if low > bottom else 0.0
                 d_high = -high * inv if high < top else 0.0
                 low, high = max(low, bottom), min(high, top)
-                while piece < len(shape) - 2 and shape[piece + 1, 0] <= low:
+                while piece < knots - 2 and shapes[s, piece + 1, 0] <= low:
                     piece += 1
-                low_left, low_right = _edges_at(shape, piece, low, bulge, half, middle)
+                low_left, low_right = _edges_at(shapes, s, piece, low, bulge, half, middle)
                 upper = piece
-                while upper < len(shape) - 2 and shape[upper + 1, 0] <= high:
+                while upper < knots - 2 and shapes[s, upper + 1, 0] <= high:
                     upper += 1
-                high_left, high_right = _edges_at(shape, upper, high, bulge, half, middle)
+                high_left, high_right = _edges_at(shapes, s, upper, high, bulge, half, middle)
                 if left_moves:
                     slope += (
-                        by_left * w * _edge_slope(r, table[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
+                        by_left * w * _edge_slope(r, lefts[k] * inv, low, high, low_left, high_left, d_low, d_high)
                     )
                 if right_moves:
                     slope += (
                         by_right
                         * w
-                        * _edge_slope(r, table[1, k] * inv, low, high, low_right, high_right, d_low, d_high)
+                        * _edge_slope(r, rights[k] * inv, low, high, low_right, high_right, d_low, d_high)
                     )
                 slope += by_weight * ((d_high - d_low) * inv_area - w) * inv
             for k in range(4):

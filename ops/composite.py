@@ -4,7 +4,7 @@ Everything here is normalised by coverage: a colour is always a weighted mean of
 constant whatever the weights are, at silhouettes, between bins and at the image border.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -57,7 +57,7 @@ def pull_push(values: Tensor, weight: Tensor) -> Tensor:
     return filled
 
 
-def fill_until_full(bins: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def fill_until_full(bins: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Mix the blurred bins of one surface, front to back, until a pixel is covered.
 
     The bins are parts of one surface, so their coverages add up before they occlude: a bin counts for what the bins
@@ -70,14 +70,12 @@ def fill_until_full(bins: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tens
         The mean colour ``(B, C, H, W)`` and the sum of all coverages ``(B, 1, H, W)``, which varying blur may raise
         above 1.
     """
-    mixed: Tensor | float = 0.0
-    taken: Tensor | float = 0.0
-    total: Tensor | float = 0.0
+    mixed, total = (torch.zeros_like(t) for t in bins[0])
+    taken = total
     for colour, coverage in bins:
         coverage = coverage.clamp_min(0)
-        counts = torch.minimum(coverage, (1 - taken + torch.zeros_like(coverage)).clamp_min(0))
+        counts = torch.minimum(coverage, (1 - taken).clamp_min(0))
         mixed = mixed + colour * (counts / coverage.clamp_min(TINY))
         taken = taken + counts
         total = total + coverage
-    assert isinstance(taken, Tensor) and isinstance(total, Tensor)  # noqa: S101, PT018
     return mixed / taken.clamp_min(TINY), total

@@ -12,8 +12,8 @@ from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
-CHUNK = 1 << 21
-"""Most points that the torch path expands at a time: about 0.4 GB of scratch for four channels."""
+CHUNK = 1 << 20
+"""Most points that the torch path expands at a time: about 0.5 GB of scratch for four channels."""
 
 _MARGIN = 2  # rows and columns around the torch path's buffer that catch what lands outside
 
@@ -149,21 +149,21 @@ def _expand(index: Tensor, counts: Tensor, alive: Tensor) -> Iterator[tuple[Tens
         start, done = stop, int(ends[stop - 1])
 
 
-def _shares(
+def _targets(
     pixels: Tensor,
-    points: Tensor,
+    offsets: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
     size: tuple[int, int],
     pad: int,
-) -> list[tuple[Tensor, Tensor]]:
-    """The four cells that each point ``(N, 3)`` adds to, and how much of its pixel's value goes there.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """For points at ``offsets`` from their ``pixels``: the upper left of four cells, and the shares right and down.
 
     ``pixels`` are flat indices into ``(B, H, W)``, as for ``rotation (2, 2, B*H*W)`` and ``position (2, B*H*W)``;
     cells are flat indices into the padded buffer with its margin.
     """
     h, w = size
-    target, weight = points[:, :2].T, points[:, 2]
+    target = offsets.T
     if rotation is not None:
         target = (rotation.index_select(2, pixels) * target).sum(1)
     if position is not None:
@@ -171,17 +171,11 @@ def _shares(
     else:
         target = target + torch.stack([pixels % w, pixels // w % h])
     x, y = target + pad
-    column = x.detach().floor().clamp(-_MARGIN, w + 2 * pad)
-    row = y.detach().floor().clamp(-_MARGIN, h + 2 * pad)
-    right, down = x - column, y - row
+    column = x.floor().clamp(-_MARGIN, w + 2 * pad)
+    row = y.floor().clamp(-_MARGIN, h + 2 * pad)
     rows, stride = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
     cell = (pixels // (h * w) * rows + row.long() + _MARGIN) * stride + column.long() + _MARGIN
-    return [
-        (cell, weight * (1 - down) * (1 - right)),
-        (cell + 1, weight * (1 - down) * right),
-        (cell + stride, weight * down * (1 - right)),
-        (cell + stride + 1, weight * down * right),
-    ]
+    return cell, x - column, y - row
 
 
 def _splat_points_torch(
@@ -200,10 +194,17 @@ def _splat_points_torch(
     turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
     out = torch.zeros(c, b * rows * columns, dtype=work, device=values.device)
     for pixels, numbers in _expand(index, counts, (flat != 0).any(0)):
-        source = flat.index_select(1, pixels)
-        for cell, share in _shares(pixels, points[numbers], turn, place, (h, w), pad):
-            if share.any():  # of the four corners of a whole target three get nothing
-                out.index_add_(1, cell, source * share)
+        here = points.index_select(0, numbers)
+        cell, right, down = _targets(pixels, here[:, :2], turn, place, (h, w), pad)
+        source = flat.index_select(1, pixels) * here[:, 2]
+        for step, share in (
+            (0, (1 - down) * (1 - right)),
+            (1, (1 - down) * right),
+            (columns, down * (1 - right)),
+            (columns + 1, down * right),
+        ):
+            if share.any():  # three of the four corners of whole targets get nothing
+                out.index_add_(1, cell + step, source * share)
     inner = slice(_MARGIN, -_MARGIN)
     return out.reshape(c, b, rows, columns)[..., inner, inner].movedim(0, 1).to(values.dtype).contiguous()
 
@@ -220,32 +221,44 @@ def _gather_points_torch(
 ) -> list[Tensor]:
     """Gradients of ``values`` and, if ``geometry``, of ``points``, ``rotation`` and ``position`` as far as given.
 
-    The splat is linear in the buffer, so its backward pass is the gradient of ``sum(value * weight * g(target))``
-    with ``g`` the incoming gradient, interpolated bilinearly. It is taken piece by piece.
+    The splat is linear in the buffer, so this is the gradient of ``sum(value * weight * g(target))`` with ``g`` the
+    incoming gradient, interpolated bilinearly.
     """
     h, w = values.shape[-2:]
     pad = (grad.shape[-1] - w) // 2
+    stride = w + 2 * (pad + _MARGIN)
     work = working_dtype(values.device)
     g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
-    every = {"values": values, "points": points, "rotation": rotation, "position": position}
-    given = {name: t for name, t in every.items() if t is not None}
-    flat = {name: t if t is points else _flatten(t).to(work) for name, t in given.items()}
-
-    def energy(wanted: dict[str, Tensor], pixels: Tensor, numbers: Tensor) -> Tensor:
-        t = flat | wanted
-        here = t["points"].index_select(0, numbers)
-        shares = _shares(pixels, here, t.get("rotation"), t.get("position"), (h, w), pad)
-        mass = torch.stack([share * g.index_select(1, cell) for cell, share in shares]).sum(0)
-        return (t["values"].index_select(1, pixels) * mass).sum()
-
-    # Within an operator autograd is off, whatever `torch.enable_grad` says; `torch.func` is not.
-    slopes = torch.func.grad(energy)
-    wanted = flat if geometry else {"values": flat["values"]}
-    total = {name: torch.zeros_like(t) for name, t in wanted.items()}
-    for piece in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
-        for name, dt in slopes(wanted, *piece).items():
-            total[name] += dt
-    return [t if name == "points" else _unflatten(t, given[name]) for name, t in total.items()]
+    flat = _flatten(values).to(work)
+    turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
+    by_values, by_points = torch.zeros_like(flat), torch.zeros_like(points)
+    by_turn, by_place = (None if t is None else torch.zeros_like(t) for t in (turn, place))
+    for pixels, numbers in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
+        here = points.index_select(0, numbers)
+        offsets, weights = here[:, :2], here[:, 2]
+        cell, right, down = _targets(pixels, offsets, turn, place, (h, w), pad)
+        a, b, c, d = (g.index_select(1, cell + step) for step in (0, 1, stride, stride + 1))
+        upper, lower = a + right * (b - a), c + right * (d - c)
+        mass = upper + down * (lower - upper)
+        by_values.index_add_(1, pixels, weights * mass)
+        if not geometry:
+            continue
+        value = flat.index_select(1, pixels)
+        across = (value * (b - a + down * (d - c - b + a))).sum(0)
+        along = (value * (lower - upper)).sum(0)
+        move = weights * torch.stack([across, along])
+        if by_place is not None:
+            by_place.index_add_(1, pixels, move)
+        if turn is not None and by_turn is not None:
+            by_turn.index_add_(2, pixels, move[:, None] * offsets.T)
+            move = (turn.index_select(2, pixels) * move[:, None]).sum(0)
+        by_points.index_add_(0, numbers, torch.stack([*move, (value * mass).sum(0)], 1))
+    grads = [_unflatten(by_values, values)]
+    if geometry:
+        grads.append(by_points)
+        frame = ((by_turn, rotation), (by_place, position))
+        grads += [_unflatten(t, like) for t, like in frame if t is not None and like is not None]
+    return grads
 
 
 @torch.library.custom_op("torchbokeh::splat_points", mutates_args=())

@@ -7,6 +7,7 @@ is exact for every radius, rows enter and leave with weight zero, and the ends m
 """
 
 import math
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -162,7 +163,7 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
         wanted = torch.arange(1, side, dtype=share.dtype, device=share.device) / side
         cuts = [0.0, *heights[torch.searchsorted(share / share[-1], wanted)].tolist(), 1.0]
     pieces = []
-    for start, stop in zip(cuts[:-1], cuts[1:], strict=True):
+    for start, stop in pairwise(cuts):
         # Knots crowd towards the ends, as the edge of a disc turns there.
         t = 0.5 - 0.5 * torch.linspace(0, torch.pi, samples, dtype=heights.dtype, device=heights.device).cos()
         y = bottom + (top - bottom) * (start + (stop - start) * t)

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops._span_gradient import row_span_gradient
 from torchbokeh.ops.points import PointTable, splat_points
-from torchbokeh.ops.spans import Profile, clamp_radius, row_span, working_dtype
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, clamp_radius, row_span, working_dtype
 
 __all__ = ["PointTable", "splat_points", "splat_spans"]
 
@@ -66,25 +67,24 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
 
 
-def _row_ends(coc: Tensor, row: int, profile: Profile, where: Tensor, size: torch.Size) -> Any:
-    """The interval ends of one PSF row for the pixels ``where`` (flat indices into ``(B, H, W)``).
+def _row_ends(coc: Tensor, row: int, profile: Profile, size: tuple[int, int]) -> Any:
+    """The interval ends of one PSF row for the pixels of flat ``(B, H, W)`` images where it can be seen.
 
-    Returns the indices of the pixels it concerns into ``where``, then for the left and the right end the flat
-    index of its column in a ``(B, H, W+2)`` buffer, the share of the next column, and the weight of the row.
+    Returns the flat indices of these pixels, then for the left and the right end the flat index of its column in a
+    ``(B, H, W+2)`` buffer, the share of the next column and whether it lies within the image, and the row's weight.
     """
-    _, h, w = size
-    y, x = where // w % h, where % w
-    radius = coc.detach().abs() + 1
-    inside = ((y + row >= 0) & (y + row < h) & (radius > abs(row))).nonzero()[:, 0]
-    left, right, weight = row_span(coc.index_select(0, inside), row, profile)
-    base = (where // w + row)[inside] * (w + 2)
-    x = x[inside]
+    h, w = size
+    where = torch.arange(len(coc), device=coc.device)
+    y = where // w % h
+    pixels = where[(y + row >= 0) & (y + row < h) & (coc.abs() + 1 > abs(row))]
+    left, right, weight = row_span(coc[pixels], row, profile)
+    base = (pixels // w + row) * (w + 2)
     ends = []
     for end in (left, right):
-        u = (end + (x + 0.5)).clamp(0, w)
-        column = u.detach().floor()
-        ends.append((base + column.long(), u - column))
-    return inside, ends[0], ends[1], weight
+        u = end + (pixels % w + 0.5)
+        column = u.clamp(0, w).floor()
+        ends.append((base + column.long(), u.clamp(0, w) - column, (u > 0) & (u < w)))
+    return pixels, *ends, weight
 
 
 def _splat_spans_torch(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
@@ -92,12 +92,11 @@ def _splat_spans_torch(values: Tensor, coc: Tensor, profile: Profile, integrate:
     work = working_dtype(values.device)
     flat = values.movedim(1, 0).reshape(c, -1).to(work)
     radius = clamp_radius(coc.reshape(-1).to(work))
-    where = torch.arange(b * h * w, device=values.device)
     out = torch.zeros(c, b * h * (w + 2), dtype=work, device=values.device)
     for row in _rows(radius, h):
-        pixels, left, right, weight = _row_ends(radius, row, profile, where, torch.Size((b, h, w)))
-        share = flat[:, pixels] * weight
-        for (column, part), signed in ((left, share), (right, -share)):
+        pixels, left, right, weight = _row_ends(radius, row, profile, (h, w))
+        share = flat.index_select(1, pixels) * weight
+        for (column, part, _), signed in ((left, share), (right, -share)):
             out.index_add_(1, column, signed * (1 - part))
             out.index_add_(1, column + 1, signed * part)
     out = out.reshape(c, b, h, w + 2)[..., :w].movedim(0, 1)
@@ -121,26 +120,29 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
     b, c, h, w = values.shape
     work = working_dtype(values.device)
     g = torch.nn.functional.pad(grad.to(work), (0, 2)).movedim(1, 0).reshape(c, -1)
-    where = torch.arange(b * h * w, device=values.device)
-    size = torch.Size((b, h, w))
-
-    def energy(flat: Tensor, radius: Tensor, knots: Tensor, bulge: Tensor, row: int) -> Tensor:
-        pixels, left, right, weight = _row_ends(radius, row, Profile(knots, bulge), where, size)
-        start, stop = (g[:, column] * (1 - part) + g[:, column + 1] * part for column, part in (left, right))
-        return (flat.index_select(1, pixels) * weight * (start - stop)).sum()
-
-    # Within an operator autograd is off, whatever `torch.enable_grad` says; `torch.func` is not.
-    slopes = torch.func.grad(energy, argnums=(0, 1, 2, 3))
-    inputs = (values.movedim(1, 0).reshape(c, -1).to(work), clamp_radius(coc.reshape(-1).to(work)), *profile)
-    total = [torch.zeros_like(t) for t in inputs]
-    for row in _rows(inputs[1], h):
-        for t, dt in zip(total, slopes(*inputs, row), strict=True):
-            t += dt
-    moved = (coc.reshape(-1).abs() > 0.5).to(work)
+    flat = values.movedim(1, 0).reshape(c, -1).to(work)
+    radius = clamp_radius(coc.reshape(-1).to(work))
+    by_values, by_coc = torch.zeros_like(flat), torch.zeros_like(radius)
+    by_knots, by_bulge = torch.zeros_like(profile.knots), torch.zeros_like(profile.bulge)
+    for row in _rows(radius, h):
+        pixels, left, right, weight = _row_ends(radius, row, profile, (h, w))
+        value = flat.index_select(1, pixels)
+        mass, by_ends = torch.zeros_like(value), []
+        for (column, part, moves), sign in ((left, 1), (right, -1)):
+            here, slope = g.index_select(1, column), g.index_select(1, column + 1) - g.index_select(1, column)
+            mass += sign * (here + part * slope)
+            by_ends.append(sign * moves * weight * (value * slope).sum(0))
+        by_values.index_add_(1, pixels, weight * mass)
+        by_row = row_span_gradient(radius[pixels], row, profile, *by_ends, (value * mass).sum(0))
+        by_coc.index_add_(0, pixels, by_row[0])
+        by_knots += by_row[1]
+        by_bulge += by_row[2]
+    by_coc = by_coc.reshape(coc.shape) * (coc.abs() > MIN_RADIUS)
     return [
-        total[0].reshape(c, b, h, w).movedim(0, 1).to(values.dtype).contiguous(),
-        (total[1] * moved).reshape(coc.shape).to(coc.dtype),
-        *total[2:],
+        by_values.reshape(c, b, h, w).movedim(0, 1).to(values.dtype).contiguous(),
+        by_coc.to(coc.dtype),
+        by_knots,
+        by_bulge,
     ]
 
 

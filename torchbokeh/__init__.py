@@ -21,8 +21,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Aperture",
-    "DisparityLens",
     "Disc",
+    "DisparityLens",
     "Ellipse",
     "FFTIntegrator",
     "Lens",

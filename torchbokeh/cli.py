@@ -16,6 +16,7 @@ from torch import Tensor
 import torchbokeh
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
+from torchbokeh.psfs.aperture import Aperture, parse_aperture
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "": 1.0}
 _THIN_LENS_FLAGS = ("focus", "f_number", "focal_length", "sensor_width", "depth_scale")
@@ -87,7 +88,13 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     add("--focal-length", type=_length, metavar="LENGTH", help="default 50mm")
     add("--sensor-width", type=_length, metavar="LENGTH", help="default 36mm")
     add("--strength", type=_positive, metavar="PX", help="blur radius in pixels per unit of disparity")
-    add("--aperture", default="disc", metavar="SHAPE", help="disc, or a polygon such as 6-gon (default disc)")
+    add(
+        "--aperture",
+        type=_aperture,
+        default="disc",
+        metavar="SHAPE",
+        help="disc, or a polygon such as 6-gon (default disc)",
+    )
     add("--max-coc", type=_positive, metavar="PX", help="limit the blur radius (default: no limit)")
     add("--layers", type=_layers, default="auto", metavar="N", help="depth layers (default auto)")
     add("--exposure", type=_stops, default=0.0, metavar="STOPS", help="brighten the result (default 0)")
@@ -218,6 +225,13 @@ def _count(text: str) -> int:
     if not re.fullmatch(r"\d{1,4}", text) or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 1024, got {text!r}")
     return int(text)
+
+
+def _aperture(text: str) -> Aperture:
+    try:
+        return parse_aperture(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _layers(text: str) -> int | str:

@@ -105,7 +105,7 @@ def run_demo(out: str | Path, scale: float = 1.0, show_progress: bool = True) ->
     check_writable(out / "sheet.png")
     focal = _FOCAL_LENGTH * 1000
     camera = f"{focal:.1f} mm at f/{_F_NUMBER}, which no real lens reaches"
-    print(camera)
+    print(f"{camera}; the first time below includes loading the kernels")
     tiles = [("the photograph, sharp everywhere", image)]
     frames = []
     for name, (thing, x, y) in tqdm(_TARGETS.items(), disable=None if show_progress else True):

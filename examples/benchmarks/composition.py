@@ -1,20 +1,32 @@
-"""A small scene with an exact picture: thousands of rays through the lens per pixel.
+"""Composition against the truth: a small scene with an exact picture, thousands of rays through the lens per pixel.
 
 A floor that runs through the focus plane to a far wall, a sharp subject on it, a strongly defocused ring in front,
-and highlights on the floor, the wall and the ring. `trace` follows rays from points of the lens through the point of
+and highlights on the floor, the wall and the ring. `Tracer` follows rays from points of the lens through the point of
 sharp focus behind each pixel; the pinhole picture and its layers come from the same rays with the lens closed.
+
+Prints a Markdown table: SSIM and PSNR (on ``clip(x, 0, 1) ** (1/2.2)``) and median seconds of every way to blur it.
+
+    python examples/benchmarks/composition.py [--power 13] [--repeat 3] [--out FOLDER]
 """
 
+import argparse
 import math
+import statistics
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.stats import qmc
 from skimage import data
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 import torchbokeh as tb
+from torchbokeh.image_io import write_image
 
 FLOOR, WALL = 0.6, 9.0  # metres below and behind the camera
 SUBJECT = (2.6, -0.15, 0.15, 0.62)  # depth, x, y, radius
@@ -34,6 +46,7 @@ class Scene:
 
     @property
     def lens(self) -> tb.ThinLens:
+        """The lens of the scene."""
         return tb.ThinLens(self.focal_length, self.f_number, self.focus_distance, self.sensor_width)
 
 
@@ -109,18 +122,18 @@ class Tracer:
         )
         return (x + dx).reshape(-1), (y + dy).reshape(-1)
 
-    def truth(self, samples: int, seed: int = 0) -> Tensor:
-        """The picture through the open lens ``(1, 3, H, W)``: one lens point and one pixel offset per sample."""
+    def truth(self, power: int, seed: int = 0) -> Tensor:
+        """The picture through the open lens ``(1, 3, H, W)``: ``2**power`` pairs of lens point and pixel offset."""
         s = self.scene
         radius = s.focal_length / (2 * s.f_number)
         total = torch.zeros(3, s.height * s.width)
-        for a, b, c, d in qmc.Sobol(4, seed=seed).random(samples):
+        for a, b, c, d in qmc.Sobol(4, seed=seed).random_base2(power):
             r, phi = radius * math.sqrt(a), 2 * math.pi * b
             colour = torch.zeros_like(total)
             for layer, alpha, _ in reversed(self.surfaces(*self._grid(c, d), r * math.cos(phi), r * math.sin(phi))):
                 colour = torch.where(alpha > 0, layer, colour)
             total += colour
-        return (total / samples).reshape(1, 3, s.height, s.width).float()
+        return (total / 2**power).reshape(1, 3, s.height, s.width).float()
 
     def pinhole(self, side: int = 8) -> dict[str, Tensor]:
         """The picture with the lens closed, ``side**2`` rays per pixel, and its layers front to back.
@@ -149,3 +162,77 @@ class Tracer:
             seen = torch.maximum(seen, visible)
             left = left * (1 - layer[3:])
         return {"image": image[None], "depth": front[None], "layers": rgba[None], "layer_depth": depth[None]}
+
+
+def score(picture: Tensor, truth: Tensor) -> tuple[float, float]:
+    """SSIM and PSNR of the displayed pictures."""
+    shown, wanted = ((t[0, :3].clamp(0, 1) ** (1 / 2.2)).permute(1, 2, 0).numpy() for t in (picture, truth))
+    return (
+        float(structural_similarity(shown, wanted, channel_axis=-1, data_range=1)),
+        float(peak_signal_noise_ratio(wanted, shown, data_range=1)),
+    )
+
+
+def methods(scene: Scene, seen: dict[str, Tensor]) -> dict[str, Callable[[], Tensor]]:
+    """Every way to blur the scene, by name."""
+    image, depth, layers, layer_depth = (seen[k] for k in ("image", "depth", "layers", "layer_depth"))
+    lens = scene.lens
+    subject = layers[:, 1, 3:]
+    behind = layers[:, 1, :3] + (1 - subject) * layers[:, 2, :3]
+    behind_depth = torch.where(subject > 0.5, layer_depth[:, 1], layer_depth[:, 2])
+    coc = lens.coc(depth, scene.width)
+
+    def plain() -> Tensor:
+        splat = tb.ops.splat.splat_spans(
+            torch.cat([image, torch.ones_like(coc)], 1), coc, tb.Disc().profile(), integrate=True
+        )
+        return splat[:, :3] / splat[:, 3:]
+
+    out: dict[str, Callable[[], Tensor]] = {"no blur at all": lambda: image, "plain splat, normalised": plain}
+    inputs: dict[str, Callable[[tb.LensBlur], Tensor]] = {
+        "one RGB-D image": lambda blur: blur(image, depth),
+        "true background given": lambda blur: blur(image, depth, background=(behind, behind_depth)),
+        "true layers given": lambda blur: blur(layers, layer_depth),
+    }
+    for name, call in inputs.items():
+        for pieces in (1, 2, 3, 4):
+            blur = tb.LensBlur(lens, subapertures=pieces)
+            out[f"LensBlur, {name}, {pieces} x {pieces} sub-apertures"] = partial(call, blur)
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--power", type=int, default=13, help="the truth takes 2**power rays per pixel")
+    parser.add_argument("--repeat", type=int, default=3, help="timed runs of each method")
+    parser.add_argument("--out", type=Path, help="write every picture there")
+    parser.add_argument("--tiny", action="store_true", help="a few seconds, for the tests")
+    args = parser.parse_args()
+    scene = Scene(width=96, height=72) if args.tiny else Scene()
+    power, repeat = (6, 1) if args.tiny else (args.power, args.repeat)
+    tracer = Tracer(scene)
+    halves = [tracer.truth(power - 1, seed) for seed in (0, 1)]
+    truth = (halves[0] + halves[1]) / 2
+    seen = tracer.pinhole()
+    coc = scene.lens.coc(seen["depth"], scene.width)
+    print(f"{scene.width} x {scene.height}, CoC {coc.min():.1f} to {coc.max():.1f} px, {2**power} rays per pixel")
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
+    print("the two halves of the truth against each other: SSIM {:.4f}, PSNR {:.1f}".format(*score(*halves)))
+    print("\n| method | SSIM | PSNR | seconds |\n| --- | --- | --- | --- |")
+    if args.out:
+        args.out.mkdir(parents=True, exist_ok=True)
+        write_image(args.out / "truth.png", truth)
+    for number, (name, method) in enumerate(methods(scene, seen).items()):
+        picture = method()
+        seconds = []
+        for _ in range(repeat):
+            start = time.perf_counter()
+            method()
+            seconds.append(time.perf_counter() - start)
+        print("| {} | {:.4f} | {:.1f} | {:.3f} |".format(name, *score(picture, truth), statistics.median(seconds)))
+        if args.out:
+            write_image(args.out / f"{number}.png", picture[:, :3])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""The gradient of `row_span` by hand: within an operator torch records no graph that could be followed back."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.spans import Profile, area, knot_integrals
+
+
+def row_span_gradient(
+    coc: Tensor, row: int, profile: Profile, by_left: Tensor, by_right: Tensor, by_weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pull gradients of the outputs of `row_span` back to its inputs.
+
+    Args:
+        coc: ``(N,)`` as for `row_span`.
+        row: as for `row_span`.
+        profile: as for `row_span`.
+        by_left: ``(N,)`` gradient of the left ends.
+        by_right: ``(N,)`` gradient of the right ends.
+        by_weight: ``(N,)`` gradient of the weights.
+
+    Returns:
+        Gradients of ``coc (N,)``, ``profile.knots (K, 3)`` and ``profile.bulge ()``.
+    """
+    knots, bulge = profile
+    bottom, top = knots[0, 0], knots[-1, 0]
+    half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
+    ends = (row + torch.tensor([[-0.5], [0.5]], dtype=coc.dtype, device=coc.device)) / coc
+    ends = ends.sort(0).values  # the lower and the upper end of the row, (2, N)
+    inner = (ends > bottom) & (ends < top)
+    clamped = ends.clamp(bottom, top)
+    height = clamped[1] - clamped[0]
+    covered = height > 1e-12
+    safe = torch.where(covered, height, 1.0)
+
+    # At both ends: the edges (2, N, 2), their integrals, the semicircle and its integral.
+    rise = knots[1:, :1] - knots[:-1, :1]
+    steep = rise > 1e-9
+    slopes = torch.where(steep, (knots[1:, 1:] - knots[:-1, 1:]) / torch.where(steep, rise, 1.0), 0.0)
+    k = (torch.searchsorted(knots[:, 0].contiguous(), clamped, right=True) - 1).clamp(0, len(knots) - 2)
+    dy = (clamped - knots[k, 0])[..., None]
+    edges = knots[k, 1:] + slopes[k] * dy
+    integrals = knot_integrals(knots)[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
+    t = (clamped - middle) / half
+    circle = (1 - t * t).clamp_min(0).sqrt()
+    arcs = 0.5 * (t * circle + torch.atan2(t, circle))
+
+    mean = (integrals[1] - integrals[0]) / safe[:, None]
+    arc = half * (arcs[1] - arcs[0]) / safe
+    side = torch.tensor([-1.0, 1.0], dtype=coc.dtype, device=coc.device)
+    unit_area = area(profile)
+
+    # From the outputs to what they are made of. `edge = coc * (mean -+ bulge * arc)`, `weight = height / |coc| / area`.
+    by_edge = torch.stack([by_left, by_right], 1)
+    by_edge = torch.where(covered[:, None], torch.where(coc[:, None] < 0, by_edge.flip(1), by_edge), 0.0)
+    by_weight = torch.where(covered, by_weight, 0.0)
+    per_height = 1 / (coc.abs() * unit_area)
+    by_coc = (by_edge * (mean + side * (bulge * arc)[:, None])).sum(1) - by_weight * per_height * height / coc
+    by_mean = by_edge * coc[:, None]
+    by_round = (by_mean * side).sum(1)
+    by_arc = bulge * by_round
+    by_height = by_weight * per_height - ((by_mean * mean).sum(1) + by_arc * arc) / safe
+    by_area = -(by_weight * per_height * height).sum() / unit_area
+    by_bulge = (by_round * arc).sum() + by_area * math.pi * half
+
+    # To the ends of the row, and through them to the CoC or, where they are cut off, to the end of the shape.
+    sign = torch.tensor([[-1.0], [1.0]], dtype=coc.dtype, device=coc.device)
+    by_integral = sign[..., None] * by_mean / safe[:, None]
+    by_semicircle = sign * by_arc / safe
+    by_ends = sign * by_height + (by_integral * edges).sum(2) + by_semicircle * circle
+    by_coc = by_coc - (by_ends * inner * ends).sum(0) / coc
+    by_half = (by_semicircle * (arcs - t * circle)).sum() + by_area * math.pi * bulge
+    by_middle = -(by_semicircle * circle).sum()
+    by_bottom = (by_ends * (ends <= bottom)).sum() + 0.5 * (by_middle - by_half)
+    by_top = (by_ends * (ends >= top)).sum() + 0.5 * (by_middle + by_half)
+
+    # To the knots: the integral up to y in piece k is `before[k] + dy * (edge[k] + slope[k] * dy / 2)`.
+    k, v, dy = k.reshape(-1), by_integral.reshape(-1, 2), dy.reshape(-1, 1)
+    by_before = torch.zeros_like(knots[:, 1:]).index_add_(0, k, v)
+    by_before[-1] += by_area * side
+    by_knots = torch.zeros_like(knots)
+    by_knots[:, 1:].index_add_(0, k, v * dy)
+    by_knots[:, 0].index_add_(0, k, -(v * edges.reshape(-1, 2)).sum(1))
+    by_slope = torch.zeros_like(slopes).index_add_(0, k, 0.5 * v * dy * dy)
+    by_piece = by_before[1:].flip(0).cumsum(0).flip(0)
+    by_run = torch.where(steep, by_slope / torch.where(steep, rise, 1.0), 0.0)
+    by_rise = (0.5 * by_piece * (knots[1:, 1:] + knots[:-1, 1:]) - by_run * slopes).sum(1)
+    by_knots[1:] += torch.cat([by_rise[:, None], 0.5 * by_piece * rise + by_run], 1)
+    by_knots[:-1] += torch.cat([-by_rise[:, None], 0.5 * by_piece * rise - by_run], 1)
+    by_knots[0, 0] += by_bottom
+    by_knots[-1, 0] += by_top
+    return by_coc, by_knots, by_bulge
