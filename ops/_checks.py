@@ -27,16 +27,20 @@ def check_image(
         TypeError: not a tensor, or not of the expected kind of dtype.
         ValueError: wrong number of dimensions, wrong size, or another device.
     """
-    want = "(" + ", ".join(str(s) for s in shape) + ")"
     if not isinstance(x, Tensor):
-        raise TypeError(f"{name}: expected a tensor of shape {want}, got {type(x).__name__}")
+        raise TypeError(f"{name}: expected a tensor of shape {_written(shape)}, got {type(x).__name__}")
     if integer and (x.is_floating_point() or x.is_complex() or x.dtype == torch.bool):
         raise TypeError(f"{name}: expected an integer tensor, got {x.dtype}")
     if not integer and not x.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {x.dtype}")
     fits = x.dim() == len(shape) and all(not isinstance(s, int) or s == n for s, n in zip(shape, x.shape, strict=True))
     if not fits:
-        raise ValueError(f"{name}: expected shape {want}, got {tuple(x.shape)}")
+        raise ValueError(f"{name}: expected shape {_written(shape)}, got {tuple(x.shape)}")
     if like is not None and x.device != like.device:
         raise ValueError(f"{name}: expected device {like.device}, got {x.device}")
     return x
+
+
+def _written(shape: Sequence[int | str | None]) -> str:
+    # Only ever called for an error: `torch.compile` cannot write down a size that is not fixed.
+    return "(" + ", ".join(str(s) for s in shape) + ")"

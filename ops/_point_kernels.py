@@ -187,7 +187,7 @@ def splat_points(
     b, c, h, w = values.shape
     rows, columns = h + 2 * pad, w + 2 * pad
     groups = -(-c // 4)
-    src = interleave(values).reshape(b * groups, -1).numpy()
+    src = interleave(values).flatten(1).numpy()
     kernel = _splat_whole if _is_whole(points, rotation, position, pad) else _splat_between
     tables = _tables(index, points, counts, rotation, position, pad)
     out = torch.empty(b * groups, 4, rows, columns)

@@ -146,7 +146,7 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
         samples: knots of each piece.
 
     Returns:
-        The pieces, row by row. Their area is ``area(profile) / side**2``, up to 1e-4.
+        The pieces, row by row. Their area is ``area(profile) / side**2`` to within 0.04 %.
 
     Raises:
         ValueError: ``side`` is not positive.
@@ -156,12 +156,13 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
     if side == 1:
         return [profile]
     bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
-    with torch.no_grad():
-        heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
-        left, right = edges_at(profile, bottom + (top - bottom) * heights)
-        share = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
-        wanted = torch.arange(1, side, dtype=share.dtype, device=share.device) / side
-        cuts = [0.0, *heights[torch.searchsorted(share / share[-1], wanted)].tolist(), 1.0]
+    heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
+    left, right = edges_at(profile, bottom + (top - bottom) * heights)
+    share = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
+    wanted = share[-1] * torch.arange(1, side, dtype=share.dtype, device=share.device) / side
+    k = torch.searchsorted(share.detach(), wanted.detach())
+    part = (wanted - share[k - 1]) / (share[k] - share[k - 1])
+    cuts = torch.cat([heights[:1], torch.lerp(heights[k - 1], heights[k], part), heights[-1:]])
     pieces = []
     for start, stop in pairwise(cuts):
         # Knots crowd towards the ends, as the edge of a disc turns there.

@@ -127,13 +127,13 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
     for row in _rows(radius, h):
         pixels, left, right, weight = _row_ends(radius, row, profile, (h, w))
         value = flat.index_select(1, pixels)
-        mass, by_ends = torch.zeros_like(value), []
+        mass, by_end = torch.zeros_like(value), {}
         for (column, part, moves), sign in ((left, 1), (right, -1)):
             here, slope = g.index_select(1, column), g.index_select(1, column + 1) - g.index_select(1, column)
             mass += sign * (here + part * slope)
-            by_ends.append(sign * moves * weight * (value * slope).sum(0))
+            by_end[sign] = sign * moves * weight * (value * slope).sum(0)
         by_values.index_add_(1, pixels, weight * mass)
-        by_row = row_span_gradient(radius[pixels], row, profile, *by_ends, (value * mass).sum(0))
+        by_row = row_span_gradient(radius[pixels], row, profile, by_end[1], by_end[-1], (value * mass).sum(0))
         by_coc.index_add_(0, pixels, by_row[0])
         by_knots += by_row[1]
         by_bulge += by_row[2]

@@ -21,8 +21,8 @@ def _setting(module: nn.Module, name: str, value: float | Tensor, low: float, hi
     tensor = torch.as_tensor(value)
     if tensor.dim() != 0:
         raise ValueError(f"{name}: expected one number, got shape {tuple(tensor.shape)}")
-    if not low <= float(tensor) <= high:
-        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {float(tensor):g}")
+    if not low <= tensor.item() <= high:
+        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {tensor.item():g}")
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
     else:
@@ -78,7 +78,7 @@ class Ellipse(Aperture):
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
-        return f"squeeze={float(self.squeeze):g}, rotation={float(self.rotation):g}"
+        return f"squeeze={self.squeeze.item():g}, rotation={self.rotation.item():g}"
 
 
 class Disc(Aperture):
@@ -136,7 +136,8 @@ class Polygon(Aperture):
     def vertices(self) -> Tensor:
         """The corners ``(V, 2)`` as (x, y), y downwards, in order."""
         rotation, curvature = self.rotation.double(), self.curvature.double()
-        straight = not isinstance(self.curvature, nn.Parameter) and float(curvature) == 0
+        known = not self.curvature.requires_grad and not torch.compiler.is_compiling()
+        straight = known and curvature.item() == 0
         pieces = 1 if straight else CHORDS
         half = math.pi / self.blades
         # An arc of half-angle `bend` over a chord of half-length `sin(half)`, its height `curvature` times that
@@ -162,7 +163,7 @@ class Polygon(Aperture):
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
-        return f"blades={self.blades}, rotation={float(self.rotation):g}, curvature={float(self.curvature):g}"
+        return f"blades={self.blades}, rotation={self.rotation.item():g}, curvature={self.curvature.item():g}"
 
 
 def polygon_profile(vertices: Tensor) -> Profile:
@@ -182,7 +183,8 @@ def polygon_profile(vertices: Tensor) -> Profile:
     edges = vertices.roll(-1, 0) - vertices
     following = edges.roll(-1, 0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    if not (turns.detach() > -1e-12).all() and not (turns.detach() < 1e-12).all():
+    convex = (turns.detach() > -1e-12).all() | (turns.detach() < 1e-12).all()
+    if not torch.compiler.is_compiling() and not convex:
         raise ValueError("vertices: expected a convex polygon with its corners in order")
     y = vertices[:, 1]
     start, rise, run = y, edges[:, 1], edges[:, 0]

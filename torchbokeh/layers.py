@@ -98,27 +98,23 @@ def blurred(surface: Surface, profile: Profile) -> tuple[Tensor, Tensor, Tensor]
     """One surface through one sub-aperture.
 
     Returns:
-        The mean colour ``(B, C, H, W)``, the share ``(B, 1, H, W)`` of the light that the surface stops, and how much
-        of it the picture knows: less than 1 where it would reach in from outside or from behind something else.
+        The mean colour ``(B, C, H, W)``, the share ``(B, 1, H, W)`` of the light that the surface stops, and the
+        density of its splats: 1 where blur is even, more or less where it varies, 0 where the picture does not know
+        the surface, beyond the border or behind something else.
     """
     c = surface.colour.shape[1]
-    opaque = surface.alpha is None
     alpha = torch.ones_like(surface.coc) if surface.alpha is None else surface.alpha
     source = torch.cat([surface.colour, alpha], 1)
-
-    def bins() -> list[tuple[Tensor, Tensor]]:
-        out = []
-        for weight in bin_weights(surface.coc, surface.centres):
-            splat = splat_spans(source * weight, surface.coc, profile, integrate=True)
-            out.append((splat[:, :c], splat[:, c:]))
-        return out
-
-    colour, coverage = fill_until_full(bins())
-    if opaque:
-        return colour, torch.ones_like(coverage), (CERTAIN * coverage).clamp(max=1)
-    # Where blur varies, splats crowd or thin out. The same splats of a surface without holes say by how much.
-    whole = splat_spans(torch.ones_like(alpha), surface.coc, profile, integrate=True)
-    return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), (CERTAIN * whole).clamp(0, 1)
+    bins = []
+    for weight in bin_weights(surface.coc, surface.centres):
+        splat = splat_spans(source * weight, surface.coc, profile, integrate=True)
+        bins.append((splat[:, :c], splat[:, c:]))
+    colour, coverage = fill_until_full(bins)
+    if surface.alpha is None:
+        return colour, torch.ones_like(coverage), coverage
+    # The same splats of a surface without holes say which part of the coverage is due to their density.
+    whole = splat_spans(torch.ones_like(alpha), surface.coc, profile, integrate=True).clamp_min(0)
+    return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 
 def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Tensor, Tensor]:
@@ -126,7 +122,8 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
 
     Through one small piece of the lens, what is in front covers what is behind almost as in a pinhole picture; the
     mean over the pieces keeps the relation of coverage to lens position that one "over" of fully blurred surfaces
-    loses. A part of the view that nothing is known of, beyond the border or behind an edge, gets no vote.
+    loses. A part of the view that nothing is known of, beyond the border or behind an edge, gets no vote. Pieces are
+    weighted by the density of their splats: a highlight is lit evenly, whatever the blur does around it.
 
     Args:
         surfaces: front to back.
@@ -135,18 +132,23 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
     Returns:
         Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``, 1 where something opaque is behind.
     """
-    colour: Tensor | float = 0.0
-    covered: Tensor | float = 0.0
-    known: Tensor | float = 0.0
+    zero = torch.zeros_like(surfaces[0].coc)
+    colour = torch.zeros_like(surfaces[0].colour)
+    covered = total = zero
     for profile in pieces:
-        size = area(profile).to(surfaces[0].coc.dtype)
-        left = torch.ones_like(surfaces[0].coc)
+        seen = torch.zeros_like(colour)
+        votes = crowd = zero
+        left = zero + area(profile).to(zero.dtype)
         for surface in surfaces:
-            mean, stopped, share = blurred(surface, profile)
-            vote = size * left * stopped * share
-            colour = colour + vote * mean
-            covered = covered + vote
+            mean, stopped, density = blurred(surface, profile)
+            known = (CERTAIN * density).clamp(max=1)
+            vote = left * stopped * known
+            seen = seen + vote * mean
+            votes = votes + vote
+            crowd = crowd + vote * density
             left = left * (1 - stopped)
-        known = known + size * left * share
-    total = (covered + known + torch.zeros_like(surfaces[0].coc)).clamp_min(TINY)
-    return colour / total, covered / total
+        density = torch.where(votes > TINY, crowd / votes.clamp_min(TINY), density)
+        colour = colour + density * seen
+        covered = covered + density * votes
+        total = total + density * (votes + left * known)
+    return colour / total.clamp_min(TINY), covered / total.clamp_min(TINY)

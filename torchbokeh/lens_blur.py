@@ -1,11 +1,14 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
+from numbers import Real
+
 import torch
 from torch import Tensor, nn
 
 from torchbokeh.layers import FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.spans import MIN_RADIUS, subdivide
 from torchbokeh.plan import Hidden, Plan
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
@@ -62,6 +65,8 @@ class LensBlur(nn.Module):
             raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
         if quality != "exact":
             raise ValueError(f"quality: expected 'exact', got {quality!r}")
+        if max_coc is not None and (not isinstance(max_coc, Real) or isinstance(max_coc, bool)):
+            raise TypeError(f"max_coc: expected a number or None, got {max_coc!r}")
         if max_coc is not None and not max_coc > 0:
             raise ValueError(f"max_coc: expected a radius in px above 0, got {max_coc}")
         self.lens = lens
@@ -102,6 +107,7 @@ class LensBlur(nn.Module):
             most = self.layers or MOST_BINS
             in_front = low < stop and high > start and high - low > 1
             hidden: Hidden = "nothing"
+            bins: tuple[tuple[float, ...], ...]
             if in_front:
                 bins = bin_centres(low, stop, most), bin_centres(start, high, most)
                 hidden = "filled" if background is None else "given"
@@ -181,7 +187,7 @@ class LensBlur(nn.Module):
         self._check_plan(plan, image, background)
         if plan.sharp and not signed.requires_grad:
             return image.clone()
-        dtype = torch.promote_types(signed.dtype, image.dtype)
+        dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
             source, radii = image.to(dtype), signed.to(dtype)
@@ -214,7 +220,10 @@ class LensBlur(nn.Module):
             return None, signed, cut
         if layered:
             raise ValueError("background: expected None for layers (make it the last layer), got a background")
-        colour, behind = background if isinstance(background, tuple) else (background, None)
+        pair = background if isinstance(background, tuple) else (background, None)
+        if len(pair) != 2:
+            raise ValueError(f"background: expected an image or a pair of it and its depth, got {len(pair)} values")
+        colour, behind = pair
         check_image("background", colour, tuple(image.shape), like=image)
         if behind is not None:
             behind = self._signed("background[1]", behind, image, is_coc=coc is not None)

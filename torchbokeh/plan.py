@@ -45,7 +45,7 @@ class Plan:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
         lines = [head]
         counts = " and ".join(str(len(b)) for b in self.bins)
-        if self.layers:
+        if self.hidden == "layers":
             lines.append(
                 f"{len(self.bins)} layers of the input are blurred ({counts} bins) and composed front to back."
             )

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchbokeh.ops.spans import MIN_RADIUS, Profile, area, clamp_radius, row_span, subdivide
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, clamp_radius, row_span
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 
 SHAPES = {
@@ -155,21 +155,3 @@ def test_gradients_match_finite_differences_and_stay_finite_at_edges(shape: Aper
 def test_clamp_radius_keeps_the_sign() -> None:
     coc = torch.tensor([-3.0, -0.1, 0.0, 0.2, 0.5, 7.0])
     assert clamp_radius(coc).tolist() == [-3.0, -0.5, 0.5, 0.5, 0.5, 7.0]
-
-
-@pytest.mark.parametrize("side", [1, 2, 3])
-def test_the_pieces_of_a_shape_are_equal_and_make_up_the_whole(shape: Aperture, side: int) -> None:
-    pieces = subdivide(shape.profile(), side)
-    whole = float(area(shape.profile()))
-    assert len(pieces) == side**2
-    assert sum(float(area(p)) for p in pieces) == pytest.approx(whole, rel=2e-3)
-    for piece in pieces:
-        assert float(area(piece)) == pytest.approx(whole / side**2, rel=3e-3)
-    coc = torch.tensor([9.3, -4.0], dtype=torch.float64)
-    mean = sum(psfs(coc, p) for p in pieces) / side**2
-    assert ((mean - psfs(coc, shape.profile())).abs().sum((1, 2)) < 0.02).all()
-
-
-def test_a_shape_is_cut_into_at_least_one_piece() -> None:
-    with pytest.raises(ValueError, match="side: expected at least 1, got 0"):
-        subdivide(Disc().profile(), 0)

@@ -1,7 +1,6 @@
 import doctest
 import importlib.util
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -33,13 +32,6 @@ few = settings(deadline=None, max_examples=15)
 @pytest.fixture(params=SHAPES)
 def shape(request: pytest.FixtureRequest) -> Aperture:
     return SHAPES[request.param]
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def scene(b: int, c: int, h: int, w: int, dtype: torch.dtype = F32, reach: float = 300.0) -> tuple[Tensor, Tensor]:
@@ -163,7 +155,20 @@ def test_operators_keep_the_rules_of_torch(dtype: torch.dtype) -> None:
         torch.library.opcheck(torch.ops.torchbokeh.gather_spans.default, (*args, shape))
 
 
-@pytest.mark.usefixtures("threads")
+def test_compiles_to_one_graph_for_any_size(shape: Aperture) -> None:
+    def blur(values: Tensor, coc: Tensor) -> Tensor:
+        return splat_spans(values, coc, shape.profile(), integrate=True)
+
+    compiled = torch.compile(blur, backend="aot_eager", fullgraph=True, dynamic=True)
+    for size in ((5, 6), (7, 9)):
+        values, coc = (t.requires_grad_() for t in scene(1, 3, *size, reach=6.0))
+        results = [f(values, coc) for f in (blur, compiled)]
+        assert_close(results[1], results[0], 1e-6)
+        seed = torch.rand_like(values)
+        for mine, theirs in zip(*(gradients(out, seed, values, coc) for out in results), strict=True):
+            assert_close(mine, theirs, 1e-6)
+
+
 def test_same_bits_for_any_number_of_threads(shape: Aperture) -> None:
     values, coc = (t.requires_grad_() for t in scene(2, 5, 150, 12))
     seed = torch.rand_like(values)
@@ -192,6 +197,7 @@ class Blurred(Dataset[Tensor]):
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
 def test_works_in_forked_workers_after_the_parent_has_used_it() -> None:
+    torch.set_num_threads(2)
     data = Blurred()
     here = [data[k] for k in range(len(data))]
     loader = DataLoader(data, batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=60)
