@@ -229,14 +229,10 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
                     upper += 1
                 high_left, high_right = _edges_at(shapes, s, upper, high, bulge, half, middle)
                 if left_moves:
-                    slope += (
-                        by_left * w * _edge_slope(r, lefts[k] * inv, low, high, low_left, high_left, d_low, d_high)
-                    )
+                    slope += by_left * w * _edge_slope(r, lefts[k] * inv, low, high, low_left, high_left, d_low, d_high)
                 if right_moves:
                     slope += (
-                        by_right
-                        * w
-                        * _edge_slope(r, rights[k] * inv, low, high, low_right, high_right, d_low, d_high)
+                        by_right * w * _edge_slope(r, rights[k] * inv, low, high, low_right, high_right, d_low, d_high)
                     )
                 slope += by_weight * ((d_high - d_low) * inv_area - w) * inv
             for k in range(4):

@@ -172,7 +172,7 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
         y = torch.cat([y, inner[(inner > y[0]) & (inner < y[-1])]])
         y = y[y.detach().argsort()]
         left, right = edges_at(profile, y)
-        for k in range(side):
-            edge = left + (right - left) * (k / side), left + (right - left) * ((k + 1) / side)
+        for column in range(side):
+            edge = (left + (right - left) * ((column + end) / side) for end in (0, 1))
             pieces.append(Profile(torch.stack([y, *edge], 1), torch.zeros_like(profile.bulge)))
     return pieces

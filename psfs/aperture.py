@@ -192,8 +192,9 @@ def polygon_profile(vertices: Tensor) -> Profile:
     share = (y[:, None] - start) / torch.where(slanted, rise, 1.0)
     crosses = slanted & (share.detach() > -1e-9) & (share.detach() < 1 + 1e-9)
     x = vertices[:, 0] + run * share
-    left = torch.where(crosses, x, math.inf).amin(1)
-    right = torch.where(crosses, x, -math.inf).amax(1)
+    # The corner itself is there in any case, even where all edges at its height are too flat to be cut.
+    left = torch.minimum(torch.where(crosses, x, math.inf).amin(1), vertices[:, 0])
+    right = torch.maximum(torch.where(crosses, x, -math.inf).amax(1), vertices[:, 0])
     order = y.detach().argsort()
     return Profile(
         torch.stack([y, left, right], 1)[order],

@@ -51,7 +51,7 @@ def assert_close(got: Tensor, want: Tensor, relative: float) -> None:
 
 @pytest.mark.parametrize(("rotated", "moved"), FRAMES)
 @pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("pad", [0, 1, 4])
+@pytest.mark.parametrize("pad", [0, 2, 3])
 @pytest.mark.parametrize(("dtype", "relative"), [(F32, 2e-6), (F64, 1e-12)])
 def test_equals_adding_point_by_point(
     rotated: bool, moved: bool, whole: bool, pad: int, dtype: torch.dtype, relative: float

@@ -19,7 +19,7 @@ SHAPES = {
     "hexagon": Polygon(6),
     "round blades": Polygon(5, 0.4, 0.6),
 }
-few = settings(deadline=None, max_examples=30)
+few = settings(deadline=None, max_examples=15)
 
 
 @pytest.fixture(params=SHAPES)

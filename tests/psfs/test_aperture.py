@@ -67,6 +67,14 @@ def test_round_blades_make_a_disc(blades: int) -> None:
     assert float(difference.abs().sum()) < 0.02
 
 
+@pytest.mark.parametrize("blades", [3, 4, 5, 6])
+@pytest.mark.parametrize("curvature", [1e-12, 1e-9, 6e-8, 1e-6])
+def test_almost_straight_blades_are_as_good_as_straight_ones(blades: int, curvature: float) -> None:
+    for rotation in (0.0, math.pi / blades):
+        difference = highlight(Polygon(blades, rotation, curvature)) - highlight(Polygon(blades, rotation))
+        assert float(difference.abs().sum()) < 1e-4
+
+
 def test_curvature_runs_from_the_straight_to_the_round_blade() -> None:
     areas = [area_of(Polygon(5, curvature=c)) for c in (0.0, 1e-6, 0.25, 0.5, 0.75, 1.0)]
     assert areas == sorted(areas)
