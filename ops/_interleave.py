@@ -20,19 +20,21 @@ def _add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     indices = ir.VectorType(ir.IntType(32), len(lanes))
     f4 = ir.VectorType(ir.FloatType(), 4)
     doubles = ir.VectorType(ir.DoubleType(), len(lanes))
-    undefined = ir.Constant(f4, ir.Undefined)
+    d4 = ir.VectorType(ir.DoubleType(), 4)
+    undefined = ir.Constant(d4, ir.Undefined)
     out_data = context.make_array(sig.args[0])(context, builder, out).data
     src_data = context.make_array(sig.args[2])(context, builder, src).data
     out_ptr = builder.bitcast(builder.gep(out_data, [o]), doubles.as_pointer())
     src_ptr = builder.bitcast(builder.gep(src_data, [p]), f4.as_pointer())
     pixel = builder.load(src_ptr)
     pixel.align = 4
+    pixel = builder.fpext(pixel, d4)
     factors = undefined
     for k, weight in enumerate(weights):
         factors = builder.insert_element(factors, weight, ir.IntType(32)(k))
     pixel = builder.shuffle_vector(pixel, undefined, ir.Constant(indices, [k % 4 for k in lanes]))
     factors = builder.shuffle_vector(factors, undefined, ir.Constant(indices, [k // 4 for k in lanes]))
-    product = builder.fpext(builder.fmul(pixel, factors), doubles)
+    product = builder.fmul(pixel, factors)
     old = builder.load(out_ptr)
     old.align = 8
     store = builder.store(builder.fadd(old, product), out_ptr)
@@ -42,14 +44,14 @@ def _add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @intrinsic
 def add_one(typingctx: Any, out: Any, o: Any, src: Any, p: Any, w: Any) -> Any:
-    """``out[o:o+4] += w * src[p:p+4]``, double += float, as one vector."""
-    return types.void(out, types.int64, src, types.int64, types.float32), _add
+    """``out[o:o+4] += w * src[p:p+4]``, double += double * float, as one vector."""
+    return types.void(out, types.int64, src, types.int64, types.float64), _add
 
 
 @intrinsic
 def add_pair(typingctx: Any, out: Any, o: Any, src: Any, p: Any, w0: Any, w1: Any) -> Any:
-    """``out[o:o+4] += w0 * src[p:p+4]; out[o+4:o+8] += w1 * src[p:p+4]``, double += float, as one vector."""
-    return types.void(out, types.int64, src, types.int64, types.float32, types.float32), _add
+    """``out[o:o+4] += w0 * src[p:p+4]; out[o+4:o+8] += w1 * src[p:p+4]``, double += double * float, as one vector."""
+    return types.void(out, types.int64, src, types.int64, types.float64, types.float64), _add
 
 
 def interleave(values: Tensor) -> Tensor:

@@ -60,9 +60,9 @@ def _splat_between(src, index, points, counts, rotation, position, pad, y0, y1, 
                 f, g = u - i, v - j
                 upper, lower = w * (1.0 - g), w * g
                 o = 4 * (j * stride + i)
-                add_pair(flat, o, src, p, np.float32(upper * (1.0 - f)), np.float32(upper * f))
+                add_pair(flat, o, src, p, upper * (1.0 - f), upper * f)
                 o += 4 * stride
-                add_pair(flat, o, src, p, np.float32(lower * (1.0 - f)), np.float32(lower * f))
+                add_pair(flat, o, src, p, lower * (1.0 - f), lower * f)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -79,7 +79,7 @@ def _splat_whole(src, index, steps, weights, counts, pad, y0, y1, first, out):  
             o = 4 * ((y + pad + 1 - first) * stride + x + pad + 1)
             psf = index[y, x]
             for k in range(counts[psf], counts[psf + 1]):
-                add_one(flat, o + steps[k], src, p, np.float32(weights[k]))
+                add_one(flat, o + steps[k], src, p, weights[k])
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -1,7 +1,7 @@
 """numba kernels of `splat_spans` for CPU float32: the same numbers as the torch definition, faster.
 
 Pixels are interleaved in fours (RGB and coverage, say), so that one vector operation adds a pixel to two
-neighbouring columns. Sums run in double: a bright pixel leaves nothing behind on its row. Work is cut into
+neighbouring columns. Weights and sums are double: bright pixels leave nothing behind on their row. Work is cut into
 bands of output rows whose height does not depend on the number of threads, and each band visits its pixels in
 the same order: the result has the same bits for every thread count.
 """
@@ -132,10 +132,10 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
                 w = weights[k]
                 i = int(left)
                 f = left - i
-                add_pair(band, o + 4 * i, src, p, np.float32(w * (1.0 - f)), np.float32(w * f))
+                add_pair(band, o + 4 * i, src, p, w * (1.0 - f), w * f)
                 i = int(right)
                 f = right - i
-                add_pair(band, o + 4 * i, src, p, np.float32(-w * (1.0 - f)), np.float32(-w * f))
+                add_pair(band, o + 4 * i, src, p, -w * (1.0 - f), -w * f)
                 o += stride
     for y in range(y0, y1):
         o = (y - y0) * stride

@@ -79,7 +79,8 @@ def split_foreground(
     front = ((stop - coc) / (stop - start)).clamp(0, 1)
     known = 1 - F.max_pool2d(front, 3, 1, 1)
     colour, behind_coc = (None, None) if behind is None else behind
-    filled = pull_push(torch.cat([image, coc], 1), known)
+    # Where the foreground is beside everything, those pixels are all there is; elsewhere this weight is nothing.
+    filled = pull_push(torch.cat([image, coc], 1), torch.maximum(known, 1e-9 * (1 - front)))
     rest = filled[:, :-1] if colour is None else image * known + colour * (1 - known)
     rest_coc = filled[:, -1:] if behind_coc is None else coc * known + behind_coc * (1 - known)
     return [
@@ -146,6 +147,8 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
             seen = seen + vote * mean
             votes = votes + vote
             crowd = crowd + vote * density
+            if surface.alpha is not None:  # where no splat says what a surface hides, its own pixel does
+                stopped = torch.lerp(surface.alpha, stopped, known)
             left = left * (1 - stopped)
         density = torch.where(votes > TINY, crowd / votes.clamp_min(TINY), density)
         colour = colour + density * seen

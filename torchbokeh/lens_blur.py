@@ -93,7 +93,7 @@ class LensBlur(nn.Module):
     ) -> Plan:
         """Look at a scene once and say what it needs. Arguments are those of `forward`.
 
-        One small copy from the device; with ``plan=`` a forward pass makes none, and its shapes are static.
+        One small copy from the device, which a forward pass with ``plan=`` saves.
         """
         _, signed, cut = self._inputs(image, depth, coc, background)
         with torch.no_grad():

@@ -4,7 +4,8 @@ A floor that runs through the focus plane to a far wall, a sharp subject on it, 
 and highlights on the floor, the wall and the ring. `Tracer` follows rays from points of the lens through the point of
 sharp focus behind each pixel; the pinhole picture and its layers come from the same rays with the lens closed.
 
-Prints a Markdown table: SSIM and PSNR (on ``clip(x, 0, 1) ** (1/2.2)``) and median seconds of every way to blur it.
+Prints a Markdown table for each of three focus distances: SSIM and PSNR on ``clip(x, 0, 1) ** (1/2.2)``, without a
+border as wide as the largest radius, and median seconds of every way to blur the picture.
 
     python examples/benchmarks/composition.py [--power 13] [--repeat 3] [--out FOLDER]
 """
@@ -167,9 +168,10 @@ class Tracer:
         return {"image": image[None], "depth": front[None], "layers": rgba[None], "layer_depth": depth[None]}
 
 
-def score(picture: Tensor, truth: Tensor) -> tuple[float, float]:
-    """SSIM and PSNR of the displayed pictures."""
-    shown, wanted = ((t[0, :3].clamp(0, 1) ** (1 / 2.2)).permute(1, 2, 0).numpy() for t in (picture, truth))
+def score(picture: Tensor, truth: Tensor, border: int) -> tuple[float, float]:
+    """SSIM and PSNR of the displayed pictures, without the border that light from outside the picture reaches."""
+    inside = (0, slice(3), slice(border, -border), slice(border, -border))
+    shown, wanted = ((t[inside].clamp(0, 1) ** (1 / 2.2)).permute(1, 2, 0).numpy() for t in (picture, truth))
     return (
         float(structural_similarity(shown, wanted, channel_axis=-1, data_range=1)),
         float(peak_signal_noise_ratio(wanted, shown, data_range=1)),
@@ -220,8 +222,13 @@ def main() -> None:
         truth = (halves[0] + halves[1]) / 2
         seen = tracer.pinhole()
         coc = scene.lens.coc(seen["depth"], scene.width)
+        border = math.ceil(coc.abs().max().item())
         print(f"\nFocus on the {focus}: {size[0]} x {size[1]}, CoC {coc.min():.1f} to {coc.max():.1f} px.")
-        print("Two halves of the truth, {} rays per pixel: SSIM {:.4f}, PSNR {:.1f}.".format(2**power, *score(*halves)))
+        print(
+            "Two halves of the truth, {} rays per pixel: SSIM {:.4f}, PSNR {:.1f}.".format(
+                2**power, *score(*halves, border)
+            )
+        )
         print("\n| method | SSIM | PSNR | seconds |\n| --- | --- | --- | --- |", flush=True)
         pictures = {"truth": truth}
         for name, method in methods(scene, seen).items():
@@ -231,7 +238,7 @@ def main() -> None:
                 start = time.perf_counter()
                 method()
                 seconds.append(time.perf_counter() - start)
-            row = (*score(pictures[name], truth), statistics.median(seconds))
+            row = (*score(pictures[name], truth, border), statistics.median(seconds))
             print("| {} | {:.4f} | {:.1f} | {:.3f} |".format(name, *row), flush=True)
         if args.out:
             args.out.mkdir(parents=True, exist_ok=True)

@@ -132,7 +132,16 @@ def test_pixels_beside_the_foreground_hold_its_colour_and_are_replaced() -> None
     bins = ((-8.0,), (3.0,))
     _, one = split_foreground(image, coc, None, bins)
     _, two = split_foreground(other, coc, None, bins)
-    assert torch.equal(one.colour, two.colour)
+    torch.testing.assert_close(one.colour, two.colour, rtol=0, atol=1e-6)
+
+
+def test_where_the_foreground_is_beside_everything_the_rest_is_what_is_left() -> None:
+    image, _, _ = strip()
+    grid = (torch.arange(56) % 3 > 0).expand(1, 1, 40, 56)  # every column that is not foreground is beside it
+    _, rest = split_foreground(torch.where(grid, 9.0, image), torch.where(grid, -8.0, 3.0), None, ((-8.0,), (3.0,)))
+    assert rest.colour.max() <= 1
+    assert rest.colour.mean() == pytest.approx(0.5, abs=0.05)
+    assert torch.allclose(rest.coc, torch.full_like(rest.coc, 3.0))
 
 
 @pytest.mark.parametrize("with_coc", [True, False])
@@ -177,9 +186,10 @@ def test_the_rim_of_a_blurred_edge_is_see_through_as_the_disc_says(radius: float
     profile = got[0, 0, 20] if upright else got[0, 0, :, 20]
     want = segment((torch.arange(56) + 0.5 - 28) / radius)
     assert torch.allclose(covered, torch.ones_like(covered), atol=1e-5)
-    # Rows are rectangles with the mass of the true slab: the rounded ends of the disc are off by less than this.
-    assert torch.allclose(profile, want, rtol=0, atol=0.02 if side == 1 else 0.025)
-    assert torch.allclose(profile[12:45].sum(), want[12:45].sum(), atol=0.05)
+    # A row of the disc is drawn as a rectangle of its mass: exact across rows, and along them but for round ends.
+    slack = 1e-4 if not upright else 0.015 if radius < 3 else 0.002
+    assert torch.allclose(profile, want, rtol=0, atol=slack)
+    assert torch.allclose(profile.sum(), want.sum(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("side", [1, 2, 3])
@@ -188,12 +198,11 @@ def test_a_dot_keeps_its_energy(coc: float, side: int) -> None:
     alpha = grey(0.0)
     alpha[..., 20, 28] = 1
     colour, covered = compose([surface(grey(4.0), coc, alpha), surface(grey(0.0), 9.0)], lens(side))
-    # Half way round the disc the sub-apertures lose slivers between chords and arc; see `subdivide`.
-    assert float(colour.sum()) == pytest.approx(4.0, rel=1e-4)
+    assert float(colour.sum()) == pytest.approx(4.0, rel=1e-5)
     assert torch.allclose(covered, torch.ones_like(covered), atol=1e-5)
     colour, covered = compose([surface(grey(4.0), coc, alpha)], lens(side))
-    assert float(colour.sum()) == pytest.approx(4.0, rel=1e-4)
-    assert float(covered.sum()) == pytest.approx(1.0, rel=1e-4)
+    assert float(colour.sum()) == pytest.approx(4.0, rel=1e-5)
+    assert float(covered.sum()) == pytest.approx(1.0, rel=1e-5)
 
 
 def test_in_focus_layers_are_put_over_one_another() -> None:
@@ -226,9 +235,8 @@ def through_a_lens(front: tuple[Tensor, Tensor, float], back: tuple[Tensor, floa
 
     for place, weight in zip(u.tolist(), chord.tolist(), strict=True):
         seen = shifted(alpha, near * place)
-        total += weight * (
-            seen * shifted(colour, near * place) + (1 - seen) * shifted(back[0], back[1] * place)
-        )  # fmt: skip
+        behind = shifted(back[0], back[1] * place)
+        total += weight * (seen * shifted(colour, near * place) + (1 - seen) * behind)
     return (total / chord.sum()).view(-1, fine).mean(1).to(colour.dtype)
 
 
@@ -243,26 +251,33 @@ def test_more_sub_apertures_come_closer_to_what_a_lens_sees() -> None:
         front = surface(grey(0.4), near, edge)
         got, _ = compose([front, surface(stripes.expand(1, 1, 40, 56).clone(), far)], lens(side))
         errors.append(float((got[0, 0, 20] - want)[16:40].abs().mean()))
-    assert errors[1] < 0.75 * errors[0]
-    assert errors[2] < 0.6 * errors[0]
-    assert errors[3] < errors[2]
-    assert errors[3] < 0.01
+    one, two, three, five = errors
+    assert two < 0.6 * one
+    assert three < 0.3 * one
+    assert five < 0.2 * one
+    assert five < 0.01
 
 
-def test_an_opaque_surface_stops_all_light_and_knows_less_at_the_border() -> None:
-    back = surface(grey(0.5), 10.0)
-    colour, stopped, known = blurred(back, lens(3)[0])
+def test_an_opaque_surface_stops_all_light_and_thins_out_at_the_border() -> None:
+    colour, stopped, density = blurred(surface(grey(0.5), 10.0), lens(3)[0])
     assert torch.equal(stopped, torch.ones_like(stopped))
-    assert torch.equal(known[..., 12:28, 12:44], torch.ones(1, 1, 16, 32))
-    assert known.min() == 0  # this piece of the lens looks over the border from the corner of the picture
-    assert torch.allclose(colour[known > 1e-3], grey(0.5)[known > 1e-3], rtol=1e-4)
+    assert torch.allclose(density[..., 12:28, 12:44], torch.ones(1, 1, 16, 32))
+    assert density.min() < 1e-6  # this piece of the lens looks over the border from the corner of the picture
+    assert torch.allclose(colour[density > 1e-3], grey(0.5)[density > 1e-3], rtol=1e-4)
 
 
 def test_a_surface_with_holes_stops_what_it_covers() -> None:
-    colour, stopped, known = blurred(surface(grey(3.0), 6.0, grey(0.25)), lens(1)[0])
+    colour, stopped, density = blurred(surface(grey(3.0), 6.0, grey(0.25)), lens(1)[0])
     assert torch.allclose(stopped, grey(0.25), atol=1e-5)
     assert torch.allclose(colour, grey(3.0), rtol=1e-5)
-    assert torch.equal(known, torch.ones_like(known))
+    assert torch.allclose(density[..., 8:32, 8:48], torch.ones(1, 1, 24, 40))
+
+
+@pytest.mark.parametrize("side", [1, 2, 3])
+def test_a_foreground_hides_what_is_behind_it_at_the_border_too(side: int) -> None:
+    """Some pieces of the lens see the foreground only beyond the border, where it is not known."""
+    got, _ = compose([surface(grey(1.0), -11.0, grey(1.0)), surface(grey(0.0), 0.0)], lens(side))
+    assert torch.allclose(got, grey(1.0), atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [F32, F64])
