@@ -12,8 +12,8 @@ from torch.nn import functional as F
 
 from torchbokeh.ops._checks import check_image
 
-TINY = 1e-20
-"""Coverage below this counts as none. Far below the square of what a PSF of radius 1e5 leaves on one pixel."""
+TINY = 1e-12
+"""Coverage below this counts as none; far below what one pixel of a PSF of radius 1e5 covers."""
 
 
 def pull_push(values: Tensor, weight: Tensor) -> Tensor:

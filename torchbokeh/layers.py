@@ -154,4 +154,5 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
         colour = colour + density * seen
         covered = covered + density * votes
         total = total + density * (votes + left * known)
-    return colour / total.clamp_min(TINY), covered / total.clamp_min(TINY)
+    total = total.clamp_min(TINY**2)  # the density counts twice
+    return colour / total, covered / total

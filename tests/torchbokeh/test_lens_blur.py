@@ -22,6 +22,10 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 APERTURES = {"disc": "disc", "5-gon": "5-gon", "ellipse": Ellipse(2.0, 0.3)}
 
 
+square = torch.zeros(1, 1, 40, 56, dtype=torch.bool)
+square[..., 14:26, 20:36] = True
+
+
 def noise(*shape: int, seed: int = 0, dtype: torch.dtype = F32) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64).to(dtype)
 
@@ -104,6 +108,19 @@ def test_constant_whatever_the_coc(
     assert_constant(LensBlur(subapertures=side)(image, coc=coc, background=background), image)
 
 
+@pytest.mark.parametrize("side", [1, 2, 3])
+@pytest.mark.parametrize("radius", [1e4, 1e5, 1e6])
+def test_constant_in_constant_out_for_extreme_blur(radius: float, side: int) -> None:
+    """As where a depth map holds a few micrometres instead of nothing."""
+    image = constant(40, 56)
+    for near, far in ((radius, radius), (-radius, radius), (-radius, 0.0), (0.0, radius)):
+        coc = torch.where(square, near, far).requires_grad_()
+        out = LensBlur(subapertures=side)(image, coc=coc)
+        assert_constant(out, image)
+        (slope,) = torch.autograd.grad(out.sum(), coc)
+        assert slope.isfinite().all()
+
+
 @pytest.mark.parametrize("focus", [1.0, 2.0, INF])
 @pytest.mark.parametrize("side", [1, 2, 3])
 def test_a_constant_scene_before_the_sky_stays_constant(focus: float, side: int) -> None:
@@ -149,10 +166,6 @@ def test_no_colour_leaves_the_range_of_the_picture(kind: str) -> None:
     out = LensBlur()(image, coc=coc_map(kind, 40, 56))
     assert out.min() >= image.min() - 1e-5
     assert out.max() <= image.max() + 1e-5
-
-
-square = torch.zeros(1, 1, 40, 56, dtype=torch.bool)
-square[..., 14:26, 20:36] = True
 
 
 @pytest.mark.parametrize("subapertures", [1, 2, 3, "auto"])
@@ -275,6 +288,19 @@ def test_gradients_to_layers_and_their_coverage() -> None:
     coc = (torch.tensor([-2.6, 1.9], dtype=F64).view(1, 2, 1, 1, 1) + noise(1, 2, 1, 5, 6, dtype=F64)).requires_grad_()
     plan = dataclasses.replace(LensBlur(subapertures=2).plan(image, coc=coc), bins=((-2.7, -1.5), (1.8, 3.0)))
     assert torch.autograd.gradcheck(lambda i, c: LensBlur()(i, coc=c, plan=plan), (image, coc), fast_mode=True)
+
+
+def test_gradients_in_single_are_those_in_double() -> None:
+    image, depth = scene(12, 16, F64)
+    depth = depth.nan_to_num(posinf=50.0)
+    focus = torch.tensor(2.0, dtype=F64)
+    found = []
+    for dtype in (F32, F64):
+        inputs = [t.detach().to(dtype).requires_grad_() for t in (image, depth, focus)]
+        out = LensBlur(ThinLens(0.2, 1.8, inputs[2], 0.01), subapertures=2)(*inputs[:2])
+        found.append(torch.autograd.grad((out * noise(*out.shape, seed=7, dtype=dtype)).sum(), inputs))
+    for single, double in zip(*found, strict=True):
+        torch.testing.assert_close(single.double(), double, rtol=1e-3, atol=1e-4 * float(double.abs().max()))
 
 
 def test_gradients_reach_the_aperture_and_the_background() -> None:
