@@ -109,7 +109,7 @@ def test_constant_whatever_the_coc(
 
 
 @pytest.mark.parametrize("side", [1, 2, 3])
-@pytest.mark.parametrize("radius", [1e4, 1e5, 1e6])
+@pytest.mark.parametrize("radius", [1e4, 1e5])
 def test_constant_in_constant_out_for_extreme_blur(radius: float, side: int) -> None:
     """As where a depth map holds a few micrometres instead of nothing."""
     image = constant(40, 56)
