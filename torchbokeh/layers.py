@@ -57,7 +57,11 @@ def bin_weights(coc: Tensor, centres: Sequence[float]) -> list[Tensor]:
     if len(centres) == 1:
         return [torch.ones_like(coc)]
     place = (coc - centres[0]) / (centres[1] - centres[0])
-    place = place.clamp(0, len(centres) - 1)
+    # The outer bins lie at the smallest and the largest CoC of the scene and move with what has them, the sky say:
+    # its shares do not change, so no gradient runs through them.
+    half = 0.5 * (len(centres) - 1)
+    inside = (place - half).abs() < half - 1e-4
+    place = torch.where(inside, place, place.detach().clamp(0, 2 * half))
     return [(1 - (place - k).abs()).clamp_min(0) for k in range(len(centres))]
 
 

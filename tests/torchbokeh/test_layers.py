@@ -90,6 +90,14 @@ def test_a_pixel_at_a_centre_is_in_that_bin_alone() -> None:
     assert torch.equal(torch.cat(weights).view(3, 3), torch.eye(3))
 
 
+def test_a_pixel_at_an_outer_centre_takes_that_with_it() -> None:
+    coc = torch.tensor([-4.0, -2.5, 0.5, 2.0], dtype=F64).view(1, 1, 1, 4).requires_grad_()
+    for weight, slope in zip(bin_weights(coc, (-4.0, -1.0, 2.0)), (-1, 0, 1), strict=True):
+        (got,) = torch.autograd.grad(weight.sum(), coc, retain_graph=True)
+        want = {-1: [0, -1, 0, 0], 0: [0, 1, -1, 0], 1: [0, 0, 1, 0]}[slope]
+        assert torch.allclose(got.flatten() * 3, torch.tensor(want, dtype=F64))
+
+
 def strip(near: float = -8.0, far: float = 3.0) -> tuple[Tensor, Tensor, Tensor]:
     """A picture and its CoC with a foreground in the columns 20 to 29, and where that is."""
     image = torch.rand(1, 3, 40, 56, generator=torch.Generator().manual_seed(2))
