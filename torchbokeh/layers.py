@@ -71,7 +71,8 @@ def split_foreground(
     """What stands in front of the focus plane, and the rest with the hidden part filled in.
 
     The rest is taken from ``behind`` where the foreground hides it, or from its surroundings by pull-push, in colour
-    and in CoC. Pixels beside the foreground are replaced as well, since they hold some of its colour.
+    and in CoC. Pixels beside the foreground are replaced as well, since they hold some of its colour. Highlights are
+    not spread: one beside an edge would make all that is hidden glow.
 
     Args:
         image: ``(B, C, H, W)``.
@@ -83,14 +84,29 @@ def split_foreground(
     front = ((stop - coc) / (stop - start)).clamp(0, 1)
     known = 1 - F.max_pool2d(front, 3, 1, 1)
     colour, behind_coc = (None, None) if behind is None else behind
-    # Where the foreground is beside everything, those pixels are all there is; elsewhere this weight is nothing.
-    filled = pull_push(torch.cat([image, coc], 1), torch.maximum(known, 1e-9 * (1 - front)))
-    rest = filled[:, :-1] if colour is None else image * known + colour * (1 - known)
-    rest_coc = filled[:, -1:] if behind_coc is None else coc * known + behind_coc * (1 - known)
+    # Where the foreground is beside everything, those pixels are all there is; elsewhere the second weight is nothing.
+    last_resort = 1e-9 * (1 - front)
+    if colour is None:
+        weight = torch.maximum(known * _ordinary(image, known), last_resort)
+        planes = (t.flatten(0, 1)[:, None] for t in (image, weight))
+        colour = pull_push(*planes).reshape(image.shape)
+    if behind_coc is None:
+        behind_coc = pull_push(coc, torch.maximum(known, last_resort))
+    rest = known * image + (1 - known) * colour
+    rest_coc = known * coc + (1 - known) * behind_coc
     return [
         Surface(image * front, front, continued(coc, front), centres[0]),
         Surface(rest, None, rest_coc, centres[1]),
     ]
+
+
+def _ordinary(image: Tensor, known: Tensor) -> Tensor:
+    """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, far above four times the channel's mean."""
+    tiny = torch.finfo(image.dtype).tiny
+    brightness = image.abs()
+    usual = 4 * (brightness * known).sum((2, 3), keepdim=True) / known.sum((2, 3), keepdim=True).clamp_min(tiny)
+    ratio = (brightness / usual.clamp_min(tiny)).clamp(max=1e4)  # keeps the power, and its slope, finite
+    return 1 / (1 + ratio**4)
 
 
 def continued(coc: Tensor, alpha: Tensor) -> Tensor:

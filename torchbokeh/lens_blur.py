@@ -190,7 +190,7 @@ class LensBlur(nn.Module):
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
-            source, radii = image.to(dtype), signed.to(dtype)
+            source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             if image.dim() == 5:
                 surfaces = [
                     Surface(source[:, k, :3], source[:, k, 3:], continued(radii[:, k], source[:, k, 3:]), bins)

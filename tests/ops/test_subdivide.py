@@ -77,8 +77,8 @@ def test_the_pieces_tile_the_shape(shape: Aperture, side: int) -> None:
     for row in rows:
         for one, other in pairwise(row):
             assert torch.allclose(one.knots[:, [0, 2]], other.knots[:, [0, 1]])
-    for one, other in pairwise(rows):
-        assert float(one[0].knots[-1, 0]) == pytest.approx(float(other[0].knots[0, 0]), abs=1e-12)
+    for lower, upper in pairwise(rows):
+        assert float(lower[0].knots[-1, 0]) == pytest.approx(float(upper[0].knots[0, 0]), abs=1e-12)
     assert float(rows[0][0].knots[0, 0]) == pytest.approx(float(shape.profile().knots[0, 0]))
     assert float(rows[-1][0].knots[-1, 0]) == pytest.approx(float(shape.profile().knots[-1, 0]))
 

@@ -296,3 +296,12 @@ def test_order_counts_front_to_back(dtype: torch.dtype) -> None:
         assert got.dtype == dtype
         assert torch.allclose(got, torch.full_like(got, want), rtol=1e-5)
         assert torch.allclose(covered, torch.ones_like(covered))
+
+
+def test_a_highlight_beside_the_foreground_does_not_make_what_is_hidden_glow() -> None:
+    image, coc = torch.full((1, 3, 40, 56), 0.2), torch.full((1, 1, 40, 56), 3.0)
+    coc[..., 20:30] = -8.0
+    image[..., 20, 18] = 100.0
+    _, rest = split_foreground(image, coc, None, ((-8.0,), (3.0,)))
+    assert rest.colour[..., 20:30].max() < 0.21
+    assert rest.colour[0, 0, 20, 18] == 100.0

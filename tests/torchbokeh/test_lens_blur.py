@@ -151,6 +151,18 @@ def test_layers_of_one_colour_stay_that_colour(side: int, bins: int) -> None:
     assert_constant(blur(image, coc=coc), torch.cat([constant(40, 56), torch.ones(1, 1, 40, 56)], 1))
 
 
+def test_the_depth_of_a_layer_counts_only_where_the_layer_is() -> None:
+    image = torch.cat([noise(1, 2, 3, 40, 56), torch.ones(1, 2, 1, 40, 56)], 2)
+    image[:, 0] *= square
+    near = torch.full((1, 1, 40, 56), -6.0)
+    want, *others = (
+        LensBlur()(image, coc=torch.stack([torch.where(square, near, empty), near + 9], 1))
+        for empty in (-6.0, 0.0, -50.0, 50.0)
+    )
+    for other in others:
+        assert torch.equal(other, want)
+
+
 @pytest.mark.parametrize("aperture", APERTURES)
 def test_even_blur_is_one_normalised_splat(aperture: str) -> None:
     image, coc = noise(1, 3, 40, 56), torch.full((1, 1, 40, 56), 6.3)
@@ -158,6 +170,16 @@ def test_even_blur_is_one_normalised_splat(aperture: str) -> None:
     splat = splat_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, profile, integrate=True)
     got = LensBlur(aperture=APERTURES[aperture])(image, coc=coc)  # type: ignore[arg-type]
     torch.testing.assert_close(got, splat[:, :3] / splat[:, 3:], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [2, 3])
+def test_sub_apertures_light_a_highlight_evenly_where_blur_varies(side: int) -> None:
+    """What hides nothing looks through all pieces of the lens together as it does through the whole."""
+    image, coc = noise(1, 3, 40, 56), 3 + 4 * noise(1, 1, 40, 56, seed=6)
+    image[..., 20, 28] = 500.0
+    whole, pieces = (LensBlur(layers=1, subapertures=s)(image, coc=coc) for s in (1, side))
+    inner = (..., slice(8, -8), slice(8, -8))
+    torch.testing.assert_close(pieces[inner], whole[inner], rtol=0.01, atol=0.01)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -330,6 +352,17 @@ def test_gradients_reach_the_aperture_and_the_background() -> None:
         assert parameter.grad is not None
         assert parameter.grad.isfinite().all()
         assert parameter.grad.abs().sum() > 1e-4
+
+
+@pytest.mark.parametrize("far", [0.0, 1e-30, 1e6])
+def test_gradients_stay_finite_before_black_and_before_glare(far: float) -> None:
+    near = coc_map("blurred before sharp", 24, 32) < 0
+    image = torch.where(near, 1.0, far).repeat(1, 3, 1, 1).requires_grad_()
+    coc = torch.where(near, -8.0, 0.0).requires_grad_()
+    LensBlur()(image, coc=coc).sum().backward()
+    for tensor in (image, coc):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
 
 
 def test_a_sharp_scene_still_gives_the_lens_its_gradient() -> None:

@@ -275,7 +275,7 @@ def test_a_plan_for_layers_or_a_background_is_refused_without_them() -> None:
 
 def test_only_a_plan_is_a_plan() -> None:
     with pytest.raises(TypeError, match="plan: expected a Plan, got dict"):
-        LensBlur()(picture(), coc=halves(-7, 6), plan={"sharp": True})  # type: ignore[arg-type]
+        LensBlur()(picture(), coc=halves(-7, 6), plan={"sharp": True})
 
 
 def test_there_is_nothing_to_plan_in_an_empty_picture() -> None:
