@@ -102,10 +102,9 @@ def split_foreground(
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:
     """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, far above four times the channel's mean."""
-    tiny = torch.finfo(image.dtype).tiny
     brightness = image.abs()
-    usual = 4 * (brightness * known).sum((2, 3), keepdim=True) / known.sum((2, 3), keepdim=True).clamp_min(tiny)
-    ratio = (brightness / usual.clamp_min(tiny)).clamp(max=1e4)  # keeps the power, and its slope, finite
+    usual = 4 * (brightness * known).sum((2, 3), keepdim=True) / known.sum((2, 3), keepdim=True).clamp_min(TINY)
+    ratio = (brightness / usual.clamp_min(TINY)).clamp(max=1e4)  # keeps the power and its slope finite
     return 1 / (1 + ratio**4)
 
 

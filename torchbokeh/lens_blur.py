@@ -114,7 +114,7 @@ class LensBlur(nn.Module):
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
-            return self._finish((height, width), (low, high), clamped, (), hidden, bins, occludes)
+            return self._finish((height, width), (low, high), clamped, 0, (), hidden, bins, occludes)
 
     def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor) -> Plan:
         *_, height, width = image.shape
@@ -129,13 +129,14 @@ class LensBlur(nn.Module):
         bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
         span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
         occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        return self._finish((height, width), span, clamped, kept, "layers", bins, occludes)
+        return self._finish((height, width), span, clamped, count, kept, "layers", bins, occludes)
 
     def _finish(
         self,
         size: tuple[int, int],
         span: tuple[float, float],
         clamped: float,
+        count: int,
         kept: tuple[int, ...],
         hidden: Hidden,
         bins: tuple[tuple[float, ...], ...],
@@ -149,7 +150,7 @@ class LensBlur(nn.Module):
         else:
             pieces = 3 if hidden in ("given", "layers") else 2
         sharp = largest <= MIN_RADIUS and hidden != "layers"
-        return Plan(size, span, clamped, sharp, kept, hidden, bins, pieces, repr(self.aperture))
+        return Plan(size, span, clamped, sharp, count, kept, hidden, bins, pieces, repr(self.aperture))
 
     def forward(
         self,
@@ -247,8 +248,9 @@ class LensBlur(nn.Module):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
         if plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
-        if (plan.hidden == "layers") != (image.dim() == 5) or any(k >= image.shape[1] for k in plan.layers):
-            raise ValueError(f"plan: expected one for an image of shape {tuple(image.shape)}, got one for other layers")
+        count = image.shape[1] if image.dim() == 5 else 0
+        if plan.layer_count != count:
+            raise ValueError(f"plan: expected one for {count} layers, got one for {plan.layer_count}")
         if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (background is not None):
             raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
 

@@ -20,7 +20,8 @@ class Plan:
         coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
         clamped: share of the pixels whose radius ``max_coc`` cut.
         sharp: every radius is below half a pixel: the image passes through.
-        layers: indices of the input layers that hold anything; ``()`` for a plain image.
+        layer_count: number of input layers; 0 for a plain image.
+        layers: indices of those that hold anything.
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
@@ -31,6 +32,7 @@ class Plan:
     coc_range: tuple[float, float]
     clamped: float
     sharp: bool
+    layer_count: int
     layers: tuple[int, ...]
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]

@@ -124,6 +124,14 @@ def display(blurred: Tensor) -> np.ndarray:
     return picture.permute(1, 2, 0).numpy()
 
 
+def there_and_back(values: Tensor, radii: Tensor) -> Tensor:
+    """The splat, and its gradients to the values and the radii."""
+    leaves = values.clone().requires_grad_(), radii.clone().requires_grad_()
+    out = splat_spans(*leaves, Disc().profile(), integrate=True)
+    out.square().sum().backward()
+    return out.detach()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=1024, help="side of the picture in pixels")
@@ -140,6 +148,7 @@ def main() -> None:
         "dense scatter": partial(dense_scatter, _scatter, table, values, radii, pad),
         "dense scatter by rows": partial(dense_scatter, _scatter_rows, row_table(*table), values, radii, pad),
         "`splat_spans`": partial(splat_spans, values, radii, Disc().profile(), integrate=True),
+        "`splat_spans`, forward and backward": partial(there_and_back, values, radii),
     }
     pictures = [display(run()) for run in ways.values()]  # compiles as well
     seconds: dict[str, list[float]] = {name: [] for name in ways}
