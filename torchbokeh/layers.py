@@ -166,9 +166,9 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
             seen = seen + vote * mean
             votes = votes + vote
             crowd = crowd + vote * density
-            if surface.alpha is not None:  # where no splat says what a surface hides, its own pixel does
-                stopped = torch.lerp(surface.alpha, stopped, known)
-            left = left * (1 - stopped)
+            # Where a surface is and no splat says how much it stops, the piece has no vote on what is behind either.
+            absent = torch.zeros_like(known) if surface.alpha is None else (surface.alpha == 0).to(known.dtype)
+            left = left * torch.lerp(absent, 1 - stopped, known)
         density = torch.where(votes > TINY, crowd / votes.clamp_min(TINY), density)
         colour = colour + density * seen
         covered = covered + density * votes

@@ -305,3 +305,10 @@ def test_a_highlight_beside_the_foreground_does_not_make_what_is_hidden_glow() -
     _, rest = split_foreground(image, coc, None, ((-8.0,), (3.0,)))
     assert rest.colour[..., 20:30].max() < 0.21
     assert rest.colour[0, 0, 20, 18] == 100.0
+
+
+@pytest.mark.parametrize("side", [1, 2, 3])
+def test_a_half_transparent_foreground_stays_so_up_to_the_border(side: int) -> None:
+    front = surface(grey(1.0), -8.0, grey(0.5))
+    picture, _ = compose([front, surface(grey(0.0), 0.0)], lens(side))
+    torch.testing.assert_close(picture, grey(0.5), rtol=0, atol=1e-5)

@@ -264,9 +264,9 @@ def test_a_plan_for_something_else_is_refused(image: Tensor, coc: Tensor, backgr
 def test_a_plan_for_layers_or_a_background_is_refused_without_them() -> None:
     blur = LensBlur()
     layered = blur.plan(rgba(left_half, 1.0), coc=radii(-6, 6))
-    with pytest.raises(ValueError, match="plan: expected one for [0-9] layers, got one for [0-9]"):
+    with pytest.raises(ValueError, match=r"plan: expected one for [0-9] layers, got one for [0-9]"):
         blur(picture(), coc=halves(-7, 6), plan=layered)
-    with pytest.raises(ValueError, match="plan: expected one for [0-9] layers, got one for [0-9]"):
+    with pytest.raises(ValueError, match=r"plan: expected one for [0-9] layers, got one for [0-9]"):
         blur(rgba(left_half), coc=radii(-6), plan=layered)
     given = blur.plan(picture(), coc=halves(-7, 6), background=picture())
     with pytest.raises(ValueError, match=r"plan: expected the background it was made with \(given\), got another"):
