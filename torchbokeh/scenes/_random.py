@@ -1,0 +1,127 @@
+"""Seeds: the same key gives the same numbers in every process, and settings are given or drawn."""
+
+import hashlib
+from collections.abc import Sequence
+from numbers import Integral
+
+import numpy as np
+
+
+def rng(seed: int, *keys: int | str) -> np.random.Generator:
+    """A generator of its own for a seed and any further keys.
+
+    Streams of different keys are independent, so that a setting drawn from one never shifts the next, and
+    nothing depends on the process, the thread or Python's randomised ``hash``.
+
+    Args:
+        seed: an integer >= 0, however large.
+        keys: integers or strings that name what is drawn.
+
+    Returns:
+        A ``numpy.random.Generator``. Its bits are the same everywhere; NumPy promises the numbers made of
+        them for one version of NumPy.
+
+    Raises:
+        TypeError: ``seed`` is not an integer, or a key is neither an integer nor a string.
+        ValueError: ``seed`` is negative.
+
+    Example:
+        >>> rng(7, "noise").integers(100) == rng(7, "noise").integers(100)
+        np.True_
+    """
+    if not isinstance(seed, Integral) or isinstance(seed, bool):
+        raise TypeError(f"seed: expected an int, got {type(seed).__name__}")
+    if seed < 0:
+        raise ValueError(f"seed: expected 0 or more, got {seed}")
+    for key in keys:
+        if not isinstance(key, Integral | str) or isinstance(key, bool):
+            raise TypeError(f"keys: expected ints and strings, got {type(key).__name__}")
+    # A digest of the written key: `SeedSequence` alone takes (1, 2) and (1 + 2 * 2**32,) for the same.
+    written = ascii([str(key) if isinstance(key, str) else int(key) for key in (seed, *keys)])
+    digest = hashlib.blake2b(written.encode(), digest_size=16).digest()
+    return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
+
+
+def check_size(size: Sequence[int]) -> tuple[int, int]:
+    """The height and the width in pixels, both at least 1.
+
+    Args:
+        size: (H, W).
+
+    Returns:
+        The two as ints.
+
+    Raises:
+        TypeError: not two integers.
+        ValueError: one of them is below 1.
+
+    Example:
+        >>> check_size([3, 5])
+        (3, 5)
+    """
+    pair = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
+    if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) for n in pair):
+        raise TypeError(f"size: expected two integers (H, W), got {size!r}")
+    if min(pair) < 1:
+        raise ValueError(f"size: expected (H, W) of at least 1, got {size!r}")
+    return int(pair[0]), int(pair[1])
+
+
+def setting(name: str, value: float | None, drawn: float, low: float, high: float) -> float:
+    """The setting the caller gave, checked, or else the one that was drawn.
+
+    Args:
+        name: of the argument, for the message.
+        value: what the caller passed; None takes ``drawn``.
+        drawn: what the seed says.
+        low: the least that is allowed.
+        high: the most that is allowed.
+
+    Returns:
+        One number.
+
+    Raises:
+        TypeError: not a number.
+        ValueError: out of range, or NaN.
+
+    Example:
+        >>> setting("warp", None, 0.5, 0, 2), setting("warp", 1, 0.5, 0, 2)
+        (0.5, 1.0)
+    """
+    if value is None:
+        return float(drawn)
+    if not isinstance(value, int | float | np.number) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    if not low <= value <= high:
+        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {value:g}")
+    return float(value)
+
+
+def count_setting(name: str, value: int | None, drawn: int | np.integer, low: int, high: int) -> int:
+    """As :func:`setting`, for a whole number.
+
+    Args:
+        name: of the argument, for the message.
+        value: what the caller passed; None takes ``drawn``.
+        drawn: what the seed says.
+        low: the least that is allowed.
+        high: the most that is allowed.
+
+    Returns:
+        One integer.
+
+    Raises:
+        TypeError: not an integer.
+        ValueError: out of range.
+
+    Example:
+        >>> count_setting("teeth", None, 12, 3, 64)
+        12
+    """
+    if value is None:
+        return int(drawn)
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+    if not low <= value <= high:
+        raise ValueError(f"{name}: expected {low} to {high}, got {value}")
+    return int(value)
