@@ -4,6 +4,7 @@ A name that begins with an underscore is a module that scripts share, not a scri
 """
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,14 +17,19 @@ SCRIPTS = sorted([*EXAMPLES.glob("[!_]*.py"), *EXAMPLES.glob("benchmarks/[!_]*.p
 PICTURES = {"quickstart.py": ("new/a.png", 1), "focus_pull.py": ("new/a.gif", 4)}  # name, frames
 
 
+def run(command, folder):
+    """Run Python with these arguments; return what it printed."""
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}  # tests may run in parallel
+    done = subprocess.run([sys.executable, *command], cwd=folder, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip(), "an example says what it found or wrote"
+    return done.stdout
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(EXAMPLES)))
 def test_example_runs(script, tmp_path):
     picture, frames = PICTURES.get(script.name, (None, 0))
-    command = [sys.executable, str(script), "--tiny", *(["--out", picture] if picture else [])]
-    env = {**os.environ, "OMP_NUM_THREADS": "1"}  # tests may run in parallel
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip(), "an example says what it found or wrote"
+    run([str(script), "--tiny", *(["--out", picture] if picture else [])], tmp_path)
     if picture:
         with Image.open(tmp_path / picture) as image:
             assert image.size == (74, 50)
@@ -32,3 +38,13 @@ def test_example_runs(script, tmp_path):
 
 def test_the_examples_are_found():
     assert PICTURES.keys() <= {script.name for script in SCRIPTS}
+
+
+@pytest.mark.slow
+def test_two_processes_train_together(tmp_path):
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    said = run([*torchrun, str(EXAMPLES / "train_distributed.py"), "--tiny"], tmp_path)
+    assert "2 processes" in said
+    before, after = (float(loss) for loss in re.findall(r"loss ([0-9.]+)", said))
+    assert after < 0.8 * before
+    assert len(list(tmp_path.glob("out/train/shard-*.tar"))) == 4

@@ -23,7 +23,7 @@ MAY_IMPORT = {
 }
 LAZY = (
     *("numba", "onnx", "onnxscript", "onnxruntime", "skimage", "matplotlib"),
-    *("kornia", "PIL", "scipy", "OpenEXR", "tifffile"),
+    *("kornia", "PIL", "scipy", "OpenEXR", "tifffile", "webdataset"),
 )
 
 

@@ -11,6 +11,8 @@ if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None
         "install it with `pip install -e .`, start Python in another folder, or use the command `torchbokeh`"
     )
 
+from torchbokeh import scenes
+from torchbokeh.accumulation import AccumulationBuffer
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
 from torchbokeh.lens import DisparityLens, Lens, ThinLens
 from torchbokeh.lens_blur import LensBlur
@@ -20,6 +22,7 @@ from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccumulationBuffer",
     "Aperture",
     "Disc",
     "DisparityLens",
@@ -32,4 +35,5 @@ __all__ = [
     "PyramidIntegrator",
     "ScanlineIntegrator",
     "ThinLens",
+    "scenes",
 ]

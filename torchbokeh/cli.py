@@ -1,4 +1,4 @@
-"""Command line: ``torchbokeh render`` and ``torchbokeh demo``, also as ``python -m torchbokeh``."""
+"""Command line: ``torchbokeh render``, ``demo`` and ``dataset``, also as ``python -m torchbokeh``."""
 
 import argparse
 import math
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import torchbokeh
+from torchbokeh.cli_dataset import add_dataset
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
@@ -68,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="refocus a photograph with measured depth", allow_abbrev=False)
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
     demo.set_defaults(run=_demo)
+    add_dataset(commands.add_parser("dataset", help="write scenes with ground truth to train on", allow_abbrev=False))
     return parser
 
 

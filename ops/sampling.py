@@ -1,0 +1,100 @@
+"""Points spread evenly over a lens, the open shutter and a pixel."""
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.spans import Profile, edges_at
+
+DIMENSIONS = 5
+"""Columns of `halton`: bases 2, 3, 5, 7, 11."""
+
+
+def halton(count: int, *, first: int = 0, seed: int | None = None) -> Tensor:
+    """Points ``first`` to ``first + count`` of the Halton sequence in bases 2, 3, 5, 7 and 11.
+
+    Any run of consecutive points is spread evenly by itself. The point at the origin is left out.
+
+    Args:
+        count: how many points, >= 0.
+        first: index of the first of them, >= 0.
+        seed: turn the sequence by a random amount in every dimension (Cranley and Patterson, 1976), for points that
+            are as even and independent of the plain ones; ``None`` for the plain ones.
+
+    Returns:
+        ``(count, 5)`` in [0, 1), double.
+
+    Raises:
+        ValueError: a negative number.
+
+    Example:
+        >>> halton(2)[:, 0].tolist()
+        [0.5, 0.25]
+    """
+    for name, value in (("count", count), ("first", first), ("seed", seed or 0)):
+        if value < 0:
+            raise ValueError(f"{name}: expected 0 or more, got {value}")
+    if count == 0:
+        return torch.zeros(0, DIMENSIONS, dtype=torch.float64)
+    from scipy.stats import qmc
+
+    sequence = qmc.Halton(DIMENSIONS, scramble=False)
+    sequence.fast_forward(first + 1)
+    points = torch.from_numpy(sequence.random(count))
+    if seed is not None:
+        points = points + torch.rand(DIMENSIONS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return points.remainder(1)
+
+
+def aperture_points(profile: Profile, square: Tensor) -> Tensor:
+    """Map the unit square to an aperture so that equal areas stay equal.
+
+    Ellipses, and so the disc, take the polar map ``(sqrt(u), 2 pi v)``. Any other shape is swept row by row: u picks
+    the row, by the area above it, and v the place from its left to its right edge.
+
+    Args:
+        profile: the unit shape.
+        square: ``(N, 2)`` points (u, v) in [0, 1).
+
+    Returns:
+        ``(N, 2)`` points (x, y) in units of the aperture radius, in the dtype of the profile.
+
+    Raises:
+        ValueError: ``square`` is not of shape ``(N, 2)``.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.psfs import Disc
+        >>> aperture_points(Disc().profile(), torch.tensor([[0.25, 0.0]])).tolist()
+        [[0.5, 0.0]]
+    """
+    if square.dim() != 2 or square.shape[1] != 2:
+        raise ValueError(f"square: expected shape (N, 2), got {tuple(square.shape)}")
+    u, v = square.to(profile.knots).unbind(1)
+    bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
+    if len(profile.knots) == 2 and bool((profile.knots[:, 1] == profile.knots[:, 2]).all()):
+        across, along = u.sqrt() * (2 * torch.pi * v).cos(), u.sqrt() * (2 * torch.pi * v).sin()
+        middle = torch.lerp(profile.knots[0, 1], profile.knots[1, 1], 0.5 + 0.5 * along)
+        return torch.stack([middle + profile.bulge * across, torch.lerp(bottom, top, 0.5 + 0.5 * along)], 1)
+    heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
+    left, right = edges_at(profile, bottom + (top - bottom) * heights)
+    area = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
+    wanted = u * area[-1]
+    k = torch.searchsorted(area.detach(), wanted.detach(), right=True).clamp(1, len(area) - 1)
+    share = (wanted - area[k - 1]) / (area[k] - area[k - 1]).clamp_min(1e-30)
+    y = bottom + (top - bottom) * torch.lerp(heights[k - 1], heights[k], share)
+    left, right = edges_at(profile, y)
+    return torch.stack([torch.lerp(left, right, v), y], 1)
+
+
+def stratified(points: Tensor) -> Tensor:
+    """Replace numbers by the middles of equal strata of [0, 1) in the same order: exactly one in each.
+
+    Args:
+        points: ``(N,)``.
+
+    Example:
+        >>> stratified(torch.tensor([0.9, 0.1])).tolist()
+        [0.75, 0.25]
+    """
+    rank = points.argsort(stable=True).argsort(stable=True)
+    return (rank.to(points.dtype) + 0.5) / max(len(points), 1)

@@ -1,0 +1,154 @@
+"""The reference renderer: the mean of many views through the lens while the shutter is open."""
+
+from numbers import Real
+
+import torch
+from torch import Tensor, nn
+
+from torchbokeh.layer_views import accumulate_layers
+from torchbokeh.lens import Lens
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.scenes.camera import Camera
+from torchbokeh.scenes.scene import Scene
+from torchbokeh.scenes.views import accumulate_scene
+from torchbokeh.views import Views
+
+
+class AccumulationBuffer(nn.Module):
+    """Depth of field and motion blur as the mean of many pinhole pictures: exact in the limit of many views.
+
+    Each view looks through its own point of the lens at its own time. Points are those of the Halton sequence, mapped
+    to the aperture so that equal areas are met equally often; times are stratified over the open shutter. It takes a
+    `torchbokeh.scenes.Scene`, which has an exact picture through every point, or layers with depth, each of which is
+    warped by the parallax of its pixels.
+
+    Three techniques spend fewer operations on the same picture (chapter 3 of the defocus and bokeh dissertation).
+    Each has its own switch, all are off:
+
+    * ``level_of_detail`` (3.2): a blurred card shows a coarser level of its texture.
+    * ``reuse`` (3.3): views that put a card on the same raster cell share one rendering of it.
+    * ``subsamples`` (3.4): every view is blurred once more over the lens around it, by casting rays through its own
+      depth.
+
+    Args:
+        lens: turns the depth of layers into signed CoC; not needed for scenes, whose camera has one.
+        aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
+        views: how many, N.
+        level_of_detail: factor on the level of equation (3.3): 0 is off, 1 as in the text, less is finer.
+        reuse: raster cells per pixel and direction: 0 is off, 1 as in the text, 2 its finer grid.
+        subsamples: S, for each view; 0 is off.
+        seed: turn the sequence at random, for a picture with independent noise; ``None`` takes it as it is.
+        first: index of the first view in the sequence, to go on where another buffer ended.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a value out of its range.
+
+    Example:
+        >>> import torch
+        >>> import torchbokeh as tb
+        >>> buffer = tb.AccumulationBuffer(tb.ThinLens(0.050, 1.8, 2.0, sensor_width=0.036), views=16)
+        >>> buffer(torch.rand(1, 2, 4, 24, 32), torch.full((1, 2, 1, 24, 32), 3.0)).shape
+        torch.Size([1, 4, 24, 32])
+    """
+
+    def __init__(
+        self,
+        lens: Lens | None = None,
+        aperture: str | Aperture = "disc",
+        views: int = 256,
+        *,
+        level_of_detail: float = 0.0,
+        reuse: int = 0,
+        subsamples: int = 0,
+        seed: int | None = None,
+        first: int = 0,
+    ) -> None:
+        super().__init__()
+        if lens is not None and not isinstance(lens, Lens):
+            raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
+        if not isinstance(level_of_detail, Real) or isinstance(level_of_detail, bool):
+            raise TypeError(f"level_of_detail: expected a number, got {level_of_detail!r}")
+        if not 0 <= level_of_detail <= 4:
+            raise ValueError(f"level_of_detail: expected 0 to 4, got {level_of_detail}")
+        self.lens = lens
+        self.aperture = parse_aperture(aperture)
+        self.views = _whole("views", views, 1)
+        self.level_of_detail = float(level_of_detail)
+        self.reuse = _whole("reuse", reuse, 0)
+        self.subsamples = _whole("subsamples", subsamples, 0)
+        self.seed = None if seed is None else _whole("seed", seed, 0)
+        self.first = _whole("first", first, 0)
+
+    def extra_repr(self) -> str:
+        """The settings, for ``print``."""
+        names = ("views", "level_of_detail", "reuse", "subsamples", "seed", "first")
+        return ", ".join(f"{name}={getattr(self, name)}" for name in names)
+
+    def forward(
+        self,
+        source: Scene | Tensor,
+        depth: Camera | Tensor | None = None,
+        *,
+        coc: Tensor | None = None,
+        motion: Tensor | None = None,
+    ) -> Tensor:
+        """Render.
+
+        Args:
+            source: a `Scene`, or layers ``(B, L, 4, H, W)`` of premultiplied RGBA, front to back.
+            depth: the scene's `Camera`; or of the layers ``(B, L, 1, H, W)``, metres (``inf`` is sky) for a
+                `ThinLens`, disparity for a `DisparityLens`.
+            coc: signed CoC radius of the layers in px, in the place of ``depth``.
+            motion: of the layers ``(B, L, 2, H, W)``, the way (dx, dy) in px over the open shutter.
+
+        Returns:
+            ``(B, 4, H, W)`` premultiplied RGBA, with ``B = 1`` for a scene. That of layers is differentiable to the
+            layers, their depth, their motion and the lens.
+
+        Raises:
+            TypeError: an argument of the wrong kind.
+            ValueError: shapes, devices or values do not fit: see the message.
+        """
+        views = Views.spread(self.views, self.aperture.profile(), first=self.first, seed=self.seed)
+        settings = {"reuse": self.reuse, "subsamples": self.subsamples}
+        if isinstance(source, Scene):
+            if not isinstance(depth, Camera):
+                raise TypeError(f"depth: expected the Camera of the scene, got {type(depth).__name__}")
+            for name, value in (("coc", coc), ("motion", motion)):
+                if value is not None:
+                    raise ValueError(f"{name}: expected None for a scene, which has its own, got a tensor")
+            with torch.no_grad():
+                return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
+        check_image("source", source, ("B", "L", 4, "H", "W"))
+        signed = self._signed(source, depth, coc)
+        if motion is not None:
+            check_image("motion", motion, (*source.shape[:2], 2, *source.shape[3:]), like=source)
+        dtype = compute_dtype(source, signed)
+        layers, radii = source.to(dtype), signed.to(dtype)
+        moved = None if motion is None else motion.to(dtype)
+        return accumulate_layers(layers, radii, moved, views, level_of_detail=self.level_of_detail, **settings)
+
+    def _signed(self, layers: Tensor, depth: Camera | Tensor | None, coc: Tensor | None) -> Tensor:
+        """The signed CoC of layers."""
+        if (depth is None) == (coc is None):
+            raise ValueError("depth: expected either depth or coc, got " + ("both" if coc is not None else "neither"))
+        name, value = ("depth", depth) if coc is None else ("coc", coc)
+        checked = check_image(name, value, (*layers.shape[:2], 1, *layers.shape[3:]), like=layers)
+        if coc is None:
+            if self.lens is None:
+                raise ValueError("depth: expected coc, since this AccumulationBuffer has no lens, got depth")
+            return self.lens.coc(checked, layers.shape[-1])
+        if not bool(checked.isfinite().all()):
+            raise ValueError(f"coc: expected finite radii, got {int((~checked.isfinite()).sum())} that are not")
+        return checked
+
+
+def _whole(name: str, value: int, low: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected an int, got {value!r}")
+    if value < low:
+        raise ValueError(f"{name}: expected at least {low}, got {value}")
+    return value

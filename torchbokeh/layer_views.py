@@ -1,0 +1,118 @@
+"""Many views of layers: each is warped by the parallax of its own pixels."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchbokeh.layers import continued
+from torchbokeh.ops.raycast import subsample_blur
+from torchbokeh.views import Views, detail_levels, shared_views, smallest_radius, subsample_offsets
+
+STEPS = 4
+"""Steps to the point that a view moves to a pixel; each leaves an error smaller by the slope of the parallax."""
+
+LEVELS = 8
+
+
+class Layer:
+    """One layer, ready to be warped into views.
+
+    Args:
+        rgba: ``(B, 4, H, W)`` premultiplied.
+        coc: ``(B, 1, H, W)`` signed, px.
+        motion: ``(B, 2, H, W)`` px over the open shutter, or ``None``.
+        levels: how many levels of detail are needed.
+    """
+
+    def __init__(self, rgba: Tensor, coc: Tensor, motion: Tensor | None, levels: int) -> None:
+        alpha = rgba[:, 3:]
+        parts = [continued(coc, alpha)]
+        if motion is not None:
+            parts += [continued(motion[:, c : c + 1], alpha) for c in (0, 1)]
+        self.field = torch.cat(parts, 1)
+        self.even = bool((self.field.detach().amax((2, 3)) - self.field.detach().amin((2, 3)) < 1e-3).all())
+        self.levels = [rgba]
+        while len(self.levels) < levels and max(self.levels[-1].shape[2:]) > 1:
+            odd = (0, self.levels[-1].shape[3] % 2, 0, self.levels[-1].shape[2] % 2)
+            self.levels.append(F.avg_pool2d(F.pad(self.levels[-1], odd, mode="replicate"), 2))
+
+    def view(self, lens: Tensor, time: float, level: int) -> tuple[Tensor, Tensor]:
+        """The layer as one view has it: RGBA ``(B, 4, H, W)`` and its signed CoC ``(B, 1, H, W)``."""
+        h, w = self.field.shape[2:]
+        like = {"dtype": self.field.dtype, "device": self.field.device}
+        y, x = torch.meshgrid(*(torch.arange(n, **like) + 0.5 for n in (h, w)), indexing="ij")
+        pixel = torch.stack([x, y], -1).expand(len(self.field), h, w, 2)
+        here, field = pixel, self.field
+        # The point that comes to lie on a pixel solves `here + parallax(here) = pixel`.
+        for _ in range(1 if self.even else STEPS):
+            move = field[:, :1] * lens[:, None, None]
+            if field.shape[1] == 3:
+                move = move + field[:, 1:] * time
+            here = pixel - move.movedim(1, -1)
+            field = _at(self.field, here, 1)
+        return _at(self.levels[level], here, 2**level), field[:, :1]
+
+
+def _at(image: Tensor, place: Tensor, texel: int) -> Tensor:
+    """Bilinear look-up at ``(B, H, W, 2)`` places (x, y) in px of an image whose pixels are ``texel`` px wide."""
+    extent = place.new_tensor([image.shape[3], image.shape[2]]) * texel
+    return F.grid_sample(image, 2 * place / extent - 1, padding_mode="border", align_corners=False)
+
+
+def accumulate_layers(
+    layers: Tensor,
+    coc: Tensor,
+    motion: Tensor | None,
+    views: Views,
+    *,
+    level_of_detail: float,
+    reuse: int,
+    subsamples: int,
+) -> Tensor:
+    """The mean of the views ``(B, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
+    count = layers.shape[1]
+    offsets, scale = subsample_offsets(views.lens.detach(), subsamples)
+    # The pixels of the input are means already: shifting them would only blur them once more.
+    views = Views(views.lens * (scale if subsamples else 1.0), views.time, torch.zeros_like(views.shift))
+    with torch.no_grad():
+        held = layers[:, :, 3:] > 0
+        low = torch.where(held, coc, torch.inf).movedim(1, 0).flatten(1).amin(1).double().cpu()
+        high = torch.where(held, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1).double().cpu()
+        speed = torch.zeros_like(low)
+        if motion is not None:
+            speed = (motion.norm(dim=2, keepdim=True) * held).movedim(1, 0).flatten(1).amax(1).double().cpu()
+    kept = [k for k in range(count) if low[k] <= high[k]]
+    low, high, speed = low[kept], high[kept], speed[kept]
+    level = torch.zeros(len(views), len(kept), dtype=torch.long)
+    if level_of_detail:
+        most = torch.full_like(low, min(LEVELS, max(layers.shape[3:]).bit_length()) - 1)
+        level = detail_levels(smallest_radius(low, high), torch.ones_like(low), level_of_detail, len(views), most)
+    parents = torch.arange(len(views))[:, None].expand_as(level)
+    if reuse:
+        still = Views(views.lens.detach().cpu(), views.time, views.shift.cpu())
+        parents = shared_views(still, torch.maximum(low.abs(), high.abs()), speed, reuse, level)
+    ready = [
+        Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
+        for i, k in enumerate(kept)
+    ]
+    last = {(i, p): v for v, row in enumerate(parents.tolist()) for i, p in enumerate(row)}
+    copies: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+    total = torch.zeros_like(layers[:, 0])
+    for v in range(len(views)):
+        left = torch.ones_like(total[:, 3:])
+        picture, front, most_seen = torch.zeros_like(total), torch.zeros_like(left), torch.zeros_like(left)
+        for i, layer in enumerate(ready):
+            key = (i, int(parents[v, i]))
+            rgba, radius = copies.pop(key, None) or layer.view(
+                views.lens[key[1]].to(layers), float(views.time[key[1]]), int(level[key[1], i])
+            )
+            if last[key] > v:
+                copies[key] = rgba, radius
+            picture = picture + left * rgba
+            if subsamples:
+                visible = left * rgba[:, 3:]
+                front = torch.where(visible > most_seen, radius, front)
+                most_seen = torch.maximum(most_seen, visible)
+            left = left * (1 - rgba[:, 3:])
+        total = total + (subsample_blur(picture, front, offsets) if subsamples else picture)
+    return total / len(views)

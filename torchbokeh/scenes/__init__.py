@@ -1,0 +1,30 @@
+"""Procedural scenes with exact pictures: textured cards in space, seen through a thin lens over an open shutter."""
+
+from torchbokeh.scenes import shapes, textures
+from torchbokeh.scenes.camera import Camera
+from torchbokeh.scenes.dataset import ProceduralDataset
+from torchbokeh.scenes.recipes import RECIPES, coins, fence, gears, rain, ramp, sky, stack, whirl
+from torchbokeh.scenes.scene import Scene
+from torchbokeh.scenes.shards import read_shards, write_shards
+from torchbokeh.scenes.sprite import Backdrop, Sprite
+
+__all__ = [
+    "RECIPES",
+    "Backdrop",
+    "Camera",
+    "ProceduralDataset",
+    "Scene",
+    "Sprite",
+    "coins",
+    "fence",
+    "gears",
+    "rain",
+    "ramp",
+    "read_shards",
+    "shapes",
+    "sky",
+    "stack",
+    "textures",
+    "whirl",
+    "write_shards",
+]

@@ -1,0 +1,115 @@
+"""Training data without end: pictures, depth, motion and layers with the exact picture a camera would take."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from torchbokeh.accumulation import AccumulationBuffer
+from torchbokeh.scenes._random import check_size, rng
+from torchbokeh.scenes.recipes import RECIPES
+
+
+class ProceduralDataset(Dataset[dict[str, Any]]):
+    """Samples of the recipes: sample i is a function of ``(seed, i)`` and the settings alone.
+
+    A sample is a dict of float32 tensors: ``image (3, H, W)``, the pinhole picture, linear; ``depth (1, H, W)`` in
+    metres, ``inf`` is sky; ``motion (2, H, W)`` in px over the open shutter; ``coc (1, H, W)`` signed radius in px;
+    ``target (3, H, W)``, the mean of ``views`` views through the lens; front to back ``layers (L, 4, H, W)`` of
+    premultiplied RGBA with ``layer_depth (L, 1, H, W)`` and ``layer_motion (L, 2, H, W)``, empty ones at the back;
+    ``lens``, a dict of the four parameters of `torchbokeh.ThinLens` as 0-d tensors; ``recipe``, its name; ``index``.
+
+    Args:
+        seed: of the whole set, >= 0.
+        resolution: ``(H, W)`` of the pictures.
+        length: number of samples.
+        recipes: names from `torchbokeh.scenes.RECIPES`, each as likely; ``None`` for all of them.
+        blur: smallest and largest blur of a sample in px, where the blur of a sample is the largest CoC radius of
+            anything in it; ``None`` for 1 % to 8 % of the width.
+        views: of the target. Highlights want thousands, other things hundreds.
+        layers: L; what lies deeper is flattened into the last one.
+        level_of_detail: as for `torchbokeh.AccumulationBuffer`.
+        reuse: as for `torchbokeh.AccumulationBuffer`.
+
+    Raises:
+        ValueError: a value out of its range, or an unknown recipe.
+
+    Example:
+        >>> from torchbokeh.scenes import ProceduralDataset
+        >>> sample = ProceduralDataset(resolution=(24, 32), recipes=("sky",), views=4)[7]
+        >>> sample["target"].shape
+        torch.Size([3, 24, 32])
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        resolution: tuple[int, int] = (256, 256),
+        *,
+        length: int = 1 << 31,
+        recipes: Sequence[str] | None = None,
+        blur: tuple[float, float] | None = None,
+        views: int = 256,
+        layers: int = 6,
+        level_of_detail: float = 0.0,
+        reuse: int = 2,
+    ) -> None:
+        rng(seed)
+        self.seed = seed
+        self.resolution = check_size(resolution)
+        if length < 0:
+            raise ValueError(f"length: expected 0 or more, got {length}")
+        self.length = length
+        self.recipes = tuple(RECIPES) if recipes is None else tuple(recipes)
+        for name in self.recipes:
+            if name not in RECIPES:
+                raise ValueError(f"recipes: expected some of {', '.join(RECIPES)}, got {name!r}")
+        if not self.recipes:
+            raise ValueError("recipes: expected at least one, got none")
+        width = self.resolution[1]
+        self.blur = (0.01 * width, 0.08 * width) if blur is None else (float(blur[0]), float(blur[1]))
+        if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):
+            raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
+        if layers < 1:
+            raise ValueError(f"layers: expected at least 1, got {layers}")
+        self.layers = layers
+        self.buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
+
+    def settings(self) -> dict[str, Any]:
+        """All that the samples depend on, for a file beside them."""
+        return {
+            **{"seed": self.seed, "resolution": list(self.resolution), "recipes": list(self.recipes)},
+            **{"blur": list(self.blur), "views": self.buffer.views, "layers": self.layers},
+            **{"level_of_detail": self.buffer.level_of_detail, "reuse": self.buffer.reuse},
+        }
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not -self.length <= index < self.length:
+            raise IndexError(f"index: expected below {self.length}, got {index}")
+        index %= self.length
+        draw = rng(self.seed, "sample", index)
+        name = self.recipes[draw.integers(len(self.recipes))]
+        low, high = self.blur
+        # Small blurs are as likely as large ones, whatever the range.
+        blur = low * (high / low) ** draw.uniform() if low > 0 else draw.uniform(low, high)
+        scene, camera = RECIPES[name](int(draw.integers(1 << 31)), self.resolution, float(blur))
+        with torch.no_grad():
+            seen = scene.render(camera, samples=4, layers=self.layers)
+            target = self.buffer(scene, camera)[0, :3]
+        for key, empty in (("layers", 0.0), ("layer_depth", torch.inf), ("layer_motion", 0.0)):
+            seen[key] = _filled(seen[key], self.layers, empty)
+        del seen["alpha"]
+        lens = {key: value.clone() for key, value in camera.lens._values().items()}
+        coc = camera.lens.coc(seen["depth"], self.resolution[1])
+        return {**seen, "coc": coc, "target": target, "lens": lens, "recipe": name, "index": index}
+
+
+def _filled(layers: Tensor, count: int, empty: float) -> Tensor:
+    """Layers filled up to a number that all samples share."""
+    missing = layers.new_full((count - len(layers), *layers.shape[1:]), empty)
+    return torch.cat([layers, missing])

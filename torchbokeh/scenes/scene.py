@@ -1,0 +1,204 @@
+"""Scenes of textured cards, and the pinhole picture that a renderer starts from."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.planes import Plates, render_planes
+from torchbokeh.scenes.camera import Camera
+from torchbokeh.scenes.layering import Fragments, stack_layers
+from torchbokeh.scenes.sprite import Backdrop, Sprite, place
+
+LEVELS = 16
+"""Most levels of a texture: more than any texture has."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Cards in space before a backdrop: a world with an exact picture through any lens.
+
+    Args:
+        sprites: the cards, in any order; they may be tilted and may cut through each other.
+        backdrop: what is behind them; without one the picture is transparent there.
+
+    Raises:
+        TypeError: not sprites, or not a backdrop.
+
+    Example:
+        >>> from torchbokeh import ThinLens
+        >>> from torchbokeh.scenes import Backdrop, Camera, Scene, Sprite
+        >>> card = Sprite(torch.ones(4, 8, 8), position=(0.0, 0.0, 2.0), size=(0.5, 0.5))
+        >>> scene = Scene((card,), Backdrop(torch.full((3, 4, 4), 0.5), distance=8.0))
+        >>> camera = Camera(ThinLens(0.05, 1.8, 2.0, sensor_width=0.036), size=(48, 64))
+        >>> {name: tuple(t.shape) for name, t in scene.render(camera).items()}["layers"]
+        (2, 4, 48, 64)
+    """
+
+    sprites: tuple[Sprite, ...]
+    backdrop: Backdrop | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sprites", tuple(self.sprites))
+        for sprite in self.sprites:
+            if not isinstance(sprite, Sprite):
+                raise TypeError(f"sprites: expected Sprites, got {type(sprite).__name__}")
+        if self.backdrop is not None and not isinstance(self.backdrop, Backdrop):
+            raise TypeError(f"backdrop: expected a Backdrop or None, got {type(self.backdrop).__name__}")
+
+    def __len__(self) -> int:
+        """How many planes there are, the backdrop included."""
+        return len(self.sprites) + (self.backdrop is not None)
+
+    def to(self, device: torch.device | str) -> "Scene":
+        """The same scene with its textures on another device."""
+        sprites = tuple(replace(s, texture=s.texture.to(device)) for s in self.sprites)
+        backdrop = self.backdrop and replace(self.backdrop, texture=self.backdrop.texture.to(device))
+        return Scene(sprites, backdrop)
+
+    def plates(self, levels: int = LEVELS) -> Plates:
+        """The textures as `torchbokeh.ops.planes.render_planes` takes them, the backdrop last."""
+        textures = [
+            s.texture if s.emission == 1 else torch.cat([s.texture[:3] * s.emission, s.texture[3:]])
+            for s in self.sprites
+        ]
+        mirror, infinite = [False] * len(textures), [False] * len(textures)
+        if self.backdrop is not None:
+            textures.append(torch.cat([self.backdrop.texture, torch.ones_like(self.backdrop.texture[:1])]))
+            mirror.append(True)
+            infinite.append(self.backdrop.distance == torch.inf)
+        return Plates.build(textures, mirror, infinite, levels)
+
+    def homographies(self, camera: Camera, lens: Tensor, times: Tensor, shift: Tensor) -> Tensor:
+        """Homographies ``(V, K, 3, 3)`` from texture coordinates ``(s, t, 1)`` to ``z * (x, y, 1)``, one per view.
+
+        Args:
+            camera: the camera.
+            lens: ``(V, 2)`` points (x, y) of the lens, in units of the aperture radius.
+            times: ``(V,)`` in units of the shutter time: -0.5 is when it opens, 0.5 when it closes.
+            shift: ``(V, 2)`` by which the picture moves, in px.
+        """
+        return camera.projection(lens, shift)[:, None] @ place(self.sprites, self.backdrop, times * camera.shutter)
+
+    def render(self, camera: Camera, *, samples: int = 8, layers: int | None = None) -> dict[str, Tensor]:
+        """The pinhole picture at half time, and all that a renderer wants to know beside it.
+
+        Every card is averaged over ``samples x samples`` points of each pixel, on its own. Cards that overlap in the
+        picture come to lie in different layers, those that do not may share one, and every card lies in one layer
+        whole; only cards that cut through each other change places where they do. Put over one another, the layers
+        are the image: two cards that share a pixel are taken to cover it independently of each other.
+
+        Depth and motion do not blend. In a layer they are those of the card, at the centre of the pixel; in the
+        picture those of the card that is seen most of.
+
+        Args:
+            camera: the camera.
+            samples: points per pixel and direction.
+            layers: the most layers; what lies behind is flattened into the last of them. ``None``: as many as
+                it takes.
+
+        Returns:
+            ``image (3, H, W)`` premultiplied by ``alpha (1, H, W)``; ``depth (1, H, W)`` in metres, ``inf`` for the
+            sky and where nothing is; ``motion (2, H, W)``, the way (dx, dy) in px from the opening to the closing of
+            the shutter; and front to back, hidden surfaces included, ``layers (L, 4, H, W)`` of premultiplied RGBA,
+            ``layer_depth (L, 1, H, W)`` and ``layer_motion (L, 2, H, W)``. All float32.
+
+        Raises:
+            ValueError: ``samples`` or ``layers`` is not positive.
+        """
+        for name, value in (("samples", samples), ("layers", 1 if layers is None else layers)):
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
+        return stack_layers(self._fragments(camera, samples), layers, camera.size)
+
+    def _fragments(self, camera: Camera, samples: int) -> list[Fragments]:
+        """What each card alone shows, for the cards that are in the picture."""
+        offsets = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
+        grid = torch.cartesian_prod(offsets, offsets).reshape(-1, 2)
+        plates = self.plates()
+        times = torch.tensor([0.0, -0.5, 0.5], dtype=torch.float64)
+        matrices = self.homographies(camera, torch.zeros(3, 2), times, torch.zeros(3, 2))
+        found = []
+        for k in range(len(self)):
+            one = Plates(plates.levels[k : k + 1], plates.mirror[k : k + 1], plates.infinite[k : k + 1])
+            top, left, bottom, right = _box(matrices[0, k], one, camera.size)
+            if top >= bottom or left >= right:
+                continue
+            three = shifted(matrices[:, k], torch.tensor([[-left, -top]], dtype=torch.float64))
+            several = shifted(three[:1], grid)
+            lod = min(_minified(three[0], one, samples), len(one.levels[0]) - 1)
+            level = torch.full((len(grid), 1), lod)
+            rgba, _ = render_planes(one, inverse3(several)[:, None], level, (bottom - top, right - left))
+            if bool((rgba[0, 3] > 0).any()):
+                depth, motion = _geometry(three, rgba, one.infinite[0])
+                found.append(Fragments(top, left, rgba[0], depth, motion))
+        return found
+
+
+def shifted(homography: Tensor, shift: Tensor) -> Tensor:
+    """Homographies whose pictures are moved by ``(N, 2)`` px."""
+    out = homography.expand(max(len(shift), len(homography)), 3, 3).clone()
+    out[:, :2] += shift[:, :, None] * homography[:, 2:]
+    return out
+
+
+def _box(homography: Tensor, plate: Plates, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Rows and columns of the picture that may show a card: top, left, bottom, right; all of it where in doubt."""
+    h, w = plate.levels[0][0].shape[1:]
+    rim = 0.5 * 2.0 ** (len(plate.levels[0]) - 1)
+    x0, x1, y0, y1 = -rim, w + rim, -rim, h + rim
+    corners = torch.tensor([[x0, y0, 1], [x1, y0, 1], [x1, y1, 1], [x0, y1, 1]], dtype=torch.float64)
+    points = corners @ homography.mT
+    if plate.mirror[0] or not bool((points[:, 2] > 1e-6).all()):
+        return 0, 0, *size
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+
+    def clipped(value: Tensor, most: int) -> int:
+        return int(value.clamp(0, most))
+
+    top, bottom = clipped((y.min() - 1).floor(), size[0]), clipped((y.max() + 1).ceil(), size[0])
+    return top, clipped((x.min() - 1).floor(), size[1]), bottom, clipped((x.max() + 1).ceil(), size[1])
+
+
+def _geometry(matrices: Tensor, rgba: Tensor, infinite: bool) -> tuple[Tensor, Tensor]:
+    """Depth and motion of a card at the centres of the pixels, from its homographies half way, before and after."""
+    h, w = rgba.shape[2:]
+    if infinite:
+        return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(2, h, w)
+    middle, opening, closing = matrices
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (h, w)), indexing="ij")
+    s, t, inverse_depth = torch.einsum("ij,jyx->iyx", inverse3(middle), torch.stack([x, y, torch.ones_like(x)]))
+    # A pixel that holds some of a card while its centre looks past the card's horizon: as good as infinitely far.
+    inverse_depth = inverse_depth.clamp_min(1e-9)
+    depth = inverse_depth.reciprocal()[None]
+    if torch.equal(opening, closing):
+        return depth.to(rgba), rgba.new_zeros(2, h, w)
+    texel = torch.stack([s / inverse_depth, t / inverse_depth, torch.ones_like(s)])
+    start, stop = (torch.einsum("ij,jyx->iyx", m, texel) for m in (opening, closing))
+    motion = stop[:2] / stop[2:].clamp_min(1e-6) - start[:2] / start[2:].clamp_min(1e-6)
+    return depth.to(rgba), motion.to(rgba)
+
+
+def _minified(homography: Tensor, plate: Plates, samples: int) -> int:
+    """The level whose texels are about as far apart as the points of a pixel: finer ones would only be missed."""
+    return max(0, int(torch.log2(1 / (samples * texel_area(homography, plate.levels[0][0]).sqrt().clamp_min(1e-9)))))
+
+
+def texel_area(homography: Tensor, texture: Tensor) -> Tensor:
+    """Area in px² that a texel covers on the screen, on the average over the card; 0 where that can't be said."""
+    h, w = texture.shape[1:]
+    corners = torch.tensor([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]], dtype=torch.float64)
+    x, y, z = (corners @ homography.mT).unbind(-1)
+    x, y = x / z, y / z
+    area = 0.5 * (x * y.roll(-1, -1) - y * x.roll(-1, -1)).sum(-1).abs()
+    return torch.where((z > 0).all(-1), area, 0.0) / (h * w)
+
+
+def inverse3(matrix: Tensor) -> Tensor:
+    """Inverse of 3 x 3 matrices; zero for a card that is seen edge-on and so not at all."""
+    a, b, c = matrix.unbind(-2)
+    cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
+    determinant = (a * cofactors[..., 0]).sum(-1)[..., None, None]
+    scale = matrix.norm(dim=-1).prod(-1)[..., None, None]
+    flat = determinant.abs() <= 1e-12 * scale
+    return torch.where(flat, 0.0, cofactors / torch.where(flat, 1.0, determinant))

@@ -1,0 +1,99 @@
+"""Many views of a scene: the accumulation buffer's way to see it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.planes import Plates, render_planes
+from torchbokeh.ops.raycast import subsample_blur
+from torchbokeh.scenes.camera import Camera
+from torchbokeh.scenes.scene import Scene, inverse3, texel_area
+from torchbokeh.views import Views, detail_levels, shared_views, smallest_radius, subsample_offsets
+
+CHUNK = 16
+"""Frames held at a time while they wait for their sub-samples."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Of every card in a view, how blurred and how fast it may be.
+
+    Attributes:
+        low: ``(K,)`` smallest signed CoC in px.
+        high: ``(K,)`` largest one.
+        motion: ``(K,)`` longest way while the shutter is open, in px.
+        texel: ``(K,)`` area of a texel on the screen, in px²; 0 where it is not known.
+    """
+
+    low: Tensor
+    high: Tensor
+    motion: Tensor
+    texel: Tensor
+
+
+def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
+    """Bounds from the corners of the cards when the shutter opens, half way and when it closes."""
+    times = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
+    matrix = scene.homographies(camera, torch.zeros(3, 2), times, torch.zeros(3, 2))
+    w, h = (torch.tensor([p[0].shape[n] for p in plates.levels], dtype=torch.float64) for n in (2, 1))
+    zero, one = torch.zeros_like(w), torch.ones_like(w)
+    corners = torch.stack(
+        [torch.stack(c, -1) for c in ((zero, zero, one), (w, zero, one), (w, h, one), (zero, h, one))]
+    )
+    points = torch.einsum("vkij,ckj->vcki", matrix, corners)
+    place, depth = points[..., :2] / points[..., 2:], points[..., 2]
+    depth = torch.where(torch.tensor(plates.infinite), torch.inf, depth)
+    # What reaches behind the lens has no bound: the blur goes to infinity there.
+    inside = depth > 0
+    coc = camera.lens.coc(torch.where(inside, depth, 1e-6), camera.size[1])
+    flat = coc.reshape(-1, len(plates.levels))
+    motion = (place - place[1]).norm(dim=-1).amax((0, 1)) * 2
+    motion = torch.where(inside.all(1).all(0), motion, torch.inf)
+    still = torch.tensor(plates.mirror)  # the backdrop's corners may be anywhere, and it does not move
+    texel = torch.stack([texel_area(matrix[1, k], p[0]) for k, p in enumerate(plates.levels)])
+    return Bounds(flat.amin(0), flat.amax(0), torch.where(still, 0.0, motion), texel)
+
+
+def accumulate_scene(
+    scene: Scene, camera: Camera, views: Views, *, level_of_detail: float, reuse: int, subsamples: int
+) -> Tensor:
+    """The mean of the views ``(1, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
+    plates = scene.plates()
+    seen = bounds(scene, plates, camera)
+    count = len(views)
+    level = torch.zeros(count, len(plates.levels), dtype=torch.long)
+    if level_of_detail:
+        most = torch.tensor([len(p) - 1 for p in plates.levels])
+        level = detail_levels(smallest_radius(seen.low, seen.high), seen.texel, level_of_detail, count, most)
+    offsets, scale = subsample_offsets(views.lens, subsamples)
+    if subsamples:
+        views = Views(views.lens * scale, views.time, views.shift)
+    parents = None
+    if reuse:
+        parents = shared_views(views, torch.maximum(seen.low.abs(), seen.high.abs()), seen.motion, reuse, level)
+    inverse = inverse3(scene.homographies(camera, views.lens, views.time, views.shift))
+    if not subsamples:
+        return render_planes(plates, inverse, level, camera.size, parents=parents)[0]
+    sky = scene.backdrop is None or bool(plates.infinite[-1])
+    total = torch.zeros(1, 4, *camera.size)
+    limit = camera.lens.coc(torch.full((1, 1), torch.inf), camera.size[1])
+    for start in range(0, count, CHUNK):
+        part = slice(start, start + CHUNK)
+        own, lod, shared = inverse[part], level[part], None
+        if parents is not None:
+            chosen = parents[part]
+            own, lod = inverse.gather(0, chosen[..., None, None].expand_as(own)), level.gather(0, chosen)
+            # Of the views of this part, the first with the same parent.
+            shared = (chosen[:, None] == chosen).int().argmax(0)
+        frames, nearest = render_planes(plates, own, lod, camera.size, parents=shared, frames=True)
+        coc = camera.lens.coc(nearest.reciprocal(), camera.size[1])
+        background = None
+        if sky:
+            background = torch.zeros_like(frames)
+            if scene.backdrop is not None:
+                last = Plates(plates.levels[-1:], plates.mirror[-1:], plates.infinite[-1:])
+                background = render_planes(last, inverse[part, -1:], level[part, -1:], camera.size, frames=True)[0]
+        far = float(limit) - 1e-4 if sky else torch.inf  # 1e-4 px from the blur of infinity is infinity
+        total = total + subsample_blur(frames, coc, offsets, far=far, background=background).sum(0, keepdim=True)
+    return total / count
