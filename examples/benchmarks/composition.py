@@ -86,7 +86,8 @@ class Tracer:
     def surfaces(self, px: Tensor, py: Tensor, ux: float, uy: float) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Rays through lens point ``u`` (metres) and pixel ``p``: (colour, alpha, depth) front to back."""
         s = self.scene
-        pixel = s.sensor_width / s.width / s.focal_length
+        # Slope per pixel of the rays through the middle of the lens: the sensor stands where the focus is sharp.
+        pixel = s.sensor_width / s.width * (1 / s.focal_length - 1 / s.focus_distance)
         fx = (px - s.width / 2) * pixel * s.focus_distance
         fy = (py - s.height / 2) * pixel * s.focus_distance
         gx, gy = (fx - ux) / s.focus_distance, (fy - uy) / s.focus_distance  # direction per metre of depth
