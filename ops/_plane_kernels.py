@@ -99,11 +99,12 @@ def _render_band(  # type: ignore[no-untyped-def]
                     line[2 * c + 1] = h[c, 0]
                 low, high = _cut(line[4], line[5], -1.0, float(width))
                 if not mirror[k]:
-                    rim = 0.5 * (1 << level[v, k])
+                    lod = level[v, k]
+                    rim = 0.5 * (1 << lod)
                     for c in range(2):
                         a, b = line[2 * c], line[2 * c + 1]
                         low, high = _cut(a + rim * line[4], b + rim * line[5], low, high)
-                        far = full[k, c] + rim
+                        far = float(sizes[k, lod, c] << lod) + rim  # a level of odd size may end beyond level 0
                         low, high = _cut(far * line[4] - a, far * line[5] - b, low, high)
                         if low >= high:
                             break
@@ -222,10 +223,10 @@ def render_planes(
             place += len(flat[-1])
     texels = torch.cat(flat).reshape(-1).numpy()
     full = sizes[:, 0].astype(np.float64)
-    homographies = inverse.double().contiguous().numpy()
+    homographies = inverse.detach().double().contiguous().numpy()
     corner = homographies[:, :, 2] @ np.array([0.5 * size[1], 0.5 * size[0], 1.0])
     order = np.ascontiguousarray(np.argsort(-corner, axis=1, kind="stable"))
-    copy, columns = _copies(plates, homographies, level, size, parents)
+    copy, columns = _copies(plates, sizes, homographies, level, size, parents)
     out = torch.zeros(views if frames else 1, *size, 4, dtype=torch.float32 if frames else torch.float64)
     nearest = torch.zeros(views if frames else 0, *size)
     tables = (texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite), homographies)
@@ -235,11 +236,16 @@ def render_planes(
 
     run_all(work, [(y, min(y + BAND, size[0])) for y in range(0, size[0], BAND)])
     mean = out if frames else out / max(views, 1)
-    return mean.permute(0, 3, 1, 2).float().contiguous(), nearest[:, None]
+    return mean.permute(0, 3, 1, 2).float().contiguous(), nearest[:, None] if frames else nearest.new_zeros(0)
 
 
 def _copies(
-    plates: Plates, homographies: np.ndarray, level: Tensor, size: tuple[int, int], parents: Tensor | None
+    plates: Plates,
+    sizes: np.ndarray,
+    homographies: np.ndarray,
+    level: Tensor,
+    size: tuple[int, int],
+    parents: Tensor | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which renderings are kept for other views, ``(V, K)`` numbers or -1, and the columns each of them takes.
 
@@ -249,16 +255,14 @@ def _copies(
     copy = np.full((views, count), -1, np.int64)
     if parents is None:
         return copy, np.zeros((0, 2), np.int64)
-    codes, member, children = np.unique(
-        (parents.numpy() * count + np.arange(count)).reshape(-1), return_inverse=True, return_counts=True
-    )
-    parent, k = codes // count, codes % count
-    h = np.array([p[0].shape[1:] for p in plates.levels], np.float64)[k]
-    rim = 0.5 * 2.0 ** level.numpy()[parent, k]
-    corners = np.stack(
-        [np.stack([s, t, np.ones_like(s)], -1) for s in (-rim, h[:, 1] + rim) for t in (-rim, h[:, 0] + rim)], 1
-    )
-    matrix = homographies[parent, k]
+    codes = (parents.numpy() * count + np.arange(count)).reshape(-1)
+    _, index, member, children = np.unique(codes, return_index=True, return_inverse=True, return_counts=True)
+    view, k = index // count, index % count
+    lod = level.numpy()[view, k]
+    rim = 0.5 * 2.0**lod
+    w, h = (sizes[k, lod] * 2.0 ** lod[:, None]).T
+    corners = np.stack([np.stack([s, t, np.ones_like(s)], -1) for s in (-rim, w + rim) for t in (-rim, h + rim)], 1)
+    matrix = homographies[view, k]
     there = np.abs(np.linalg.det(matrix)) > 0
     points = np.linalg.inv(np.where(there[:, None, None], matrix, np.eye(3)))[:, None] @ corners[..., None]
     z = points[:, :, 2, 0]
@@ -269,6 +273,6 @@ def _copies(
     best = np.argsort(-children, kind="stable")
     best = best[(children[best] > 1) & there[best] & (high[best] > low[best])]
     best = best[np.cumsum(high[best] - low[best]) * BAND * 16 <= MEMORY]
-    number = np.full(len(codes), -1)
+    number = np.full(len(index), -1)
     number[best] = np.arange(len(best))
     return number[member.reshape(views, count)], np.stack([low, high - low], 1)[best]

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.ops._checks import check_image
-from torchbokeh.ops._dispatch import has_kernel
+from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
 SOLID = 1e-6
@@ -44,9 +44,14 @@ class Plates:
         cls, textures: Sequence[Tensor], mirror: Sequence[bool], infinite: Sequence[bool], count: int
     ) -> "Plates":
         """Make ``count`` levels of every texture, or as many as it takes to come down to one texel."""
+        for name, flags in (("mirror", mirror), ("infinite", infinite)):
+            if len(flags) != len(textures):
+                raise ValueError(f"{name}: expected one for each of {len(textures)} textures, got {len(flags)}")
         levels = []
         for texture, endless in zip(textures, mirror, strict=True):
             check_image("textures", texture, (4, "h", "w"))
+            if texture.numel() == 0:
+                raise ValueError(f"textures: expected at least one texel, got shape {tuple(texture.shape)}")
             pyramid = [texture]
             while len(pyramid) < count and max(pyramid[-1].shape[1:]) > 1:
                 pyramid.append(_halved(pyramid[-1], endless))
@@ -87,7 +92,8 @@ def render_planes(
     Returns:
         The mean of all views ``(1, 4, H, W)``, premultiplied RGBA, and an empty tensor. With ``frames`` every view
         ``(V, 4, H, W)``, and ``1 / z`` of what is seen most of in each pixel ``(V, 1, H, W)``: 0 where that is a
-        rectangle at infinity, or nothing. Both in the dtype of the textures.
+        rectangle at infinity, or nothing. Both in the dtype of the textures; differentiable to these and to
+        ``inverse``.
 
     Raises:
         TypeError: ``inverse`` is not a floating-point tensor or ``level`` not an integer one.
@@ -119,7 +125,9 @@ def render_planes(
         if not 0 <= int(level[:, k].min()) <= int(level[:, k].max()) < len(pyramid):
             raise ValueError(f"level: expected 0 to {len(pyramid) - 1} for rectangle {k}, got {level[:, k].tolist()}")
     texels = plates.levels[0][0] if count else torch.zeros(0)
-    if has_kernel(texels) and not any(t.requires_grad for pyramid in plates.levels for t in pyramid):
+    leaves = (inverse, *(texture for pyramid in plates.levels for texture in pyramid))
+    grads = torch.is_grad_enabled() and any(t.requires_grad for t in leaves)
+    if count and has_kernel(texels) and not grads:
         from torchbokeh.ops import _plane_kernels
 
         return _plane_kernels.render_planes(plates, inverse, level, size, parents, frames)
@@ -155,24 +163,30 @@ def _render_planes_torch(
     return (total / len(inverse)).to(texels.dtype), texels.new_zeros(0)
 
 
+def pixel_centres(size: tuple[int, int], like: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates x and y ``(H, W)`` of the centres of all pixels, of the dtype and on the device of ``like``."""
+    y, x = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in size)
+    return x.expand(size), y[:, None].expand(size)
+
+
 def _look_up(plates: Plates, k: int, lod: int, homography: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """What every pixel sees of one rectangle: RGBA ``(4, H, W)`` and ``1 / z`` ``(1, H, W)``."""
     h, w = plates.levels[k][0].shape[1:]
     texture = plates.levels[k][lod]
-    like = {"dtype": homography.dtype, "device": homography.device}
-    y, x = torch.meshgrid(*(torch.arange(n, **like) + 0.5 for n in size), indexing="ij")
+    texture = texture.to(compute_dtype(texture))  # half precision could not say where
+    x, y = pixel_centres(size, homography)
     s, t, inverse_depth = torch.einsum("ij,jyx->iyx", homography, torch.stack([x, y, torch.ones_like(x)]))
     there = inverse_depth > 0
     safe = torch.where(there, inverse_depth, 1.0)
     s, t = s / safe, t / safe
     if plates.mirror[k]:
         s, t = (n - (c.remainder(2 * n) - n).abs() for c, n in ((s, w), (t, h)))
-    extent = texture.new_tensor([texture.shape[2], texture.shape[1]], dtype=like["dtype"]) * 2.0**lod
+    extent = homography.new_tensor([texture.shape[2], texture.shape[1]]) * 2.0**lod
     # Far outside is outside: float32 could not hold where.
     grid = (2 * torch.stack([s, t], -1) / extent - 1).clamp(-9, 9).to(texture.dtype)
     padding = "border" if plates.mirror[k] else "zeros"
     rgba = F.grid_sample(texture[None], grid[None], padding_mode=padding, align_corners=False)[0]
-    rgba = torch.where(there, rgba, 0.0).to(like["dtype"])
+    rgba = torch.where(there, rgba, 0.0).to(homography.dtype)
     depth = torch.zeros_like(inverse_depth) if plates.infinite[k] else inverse_depth
     return rgba, torch.where(there, depth, -torch.inf)[None]
 

@@ -14,7 +14,11 @@ from PIL import Image
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SCRIPTS = sorted([*EXAMPLES.glob("[!_]*.py"), *EXAMPLES.glob("benchmarks/[!_]*.py")])
-PICTURES = {"quickstart.py": ("new/a.png", 1), "focus_pull.py": ("new/a.gif", 4)}  # name, frames
+PICTURES = {  # name, size, frames
+    "quickstart.py": ("new/a.png", (74, 50), 1),
+    "focus_pull.py": ("new/a.gif", (74, 50), 4),
+    "scenes.py": ("new/a.png", (128, 192), 1),
+}
 
 
 def run(command, folder):
@@ -28,11 +32,11 @@ def run(command, folder):
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: str(path.relative_to(EXAMPLES)))
 def test_example_runs(script, tmp_path):
-    picture, frames = PICTURES.get(script.name, (None, 0))
+    picture, size, frames = PICTURES.get(script.name, (None, None, 0))
     run([str(script), "--tiny", *(["--out", picture] if picture else [])], tmp_path)
     if picture:
         with Image.open(tmp_path / picture) as image:
-            assert image.size == (74, 50)
+            assert image.size == size
             assert getattr(image, "n_frames", 1) == frames
 
 

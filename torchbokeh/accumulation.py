@@ -5,6 +5,7 @@ from numbers import Real
 import torch
 from torch import Tensor, nn
 
+from torchbokeh._signed import signed_coc
 from torchbokeh.layer_views import accumulate_layers
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
@@ -36,7 +37,8 @@ class AccumulationBuffer(nn.Module):
         lens: turns the depth of layers into signed CoC; not needed for scenes, whose camera has one.
         aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
         views: how many, N.
-        level_of_detail: factor on the level of equation (3.3): 0 is off, 1 as in the text, less is finer.
+        level_of_detail: share of a CoC's area that one texel may cover: 0 is off, 1 as in the text, where texels
+            blur about as much as the lens does. ``"auto"`` is ``2 / views``: as much as lies between two views.
         reuse: raster cells per pixel and direction: 0 is off, 1 as in the text, 2 its finer grid.
         subsamples: S, for each view; 0 is off.
         seed: turn the sequence at random, for a picture with independent noise; ``None`` takes it as it is.
@@ -54,13 +56,20 @@ class AccumulationBuffer(nn.Module):
         torch.Size([1, 4, 24, 32])
     """
 
+    views: int
+    level_of_detail: float
+    reuse: int
+    subsamples: int
+    seed: int | None
+    first: int
+
     def __init__(
         self,
         lens: Lens | None = None,
         aperture: str | Aperture = "disc",
         views: int = 256,
         *,
-        level_of_detail: float = 0.0,
+        level_of_detail: float | str = 0.0,
         reuse: int = 0,
         subsamples: int = 0,
         seed: int | None = None,
@@ -69,13 +78,15 @@ class AccumulationBuffer(nn.Module):
         super().__init__()
         if lens is not None and not isinstance(lens, Lens):
             raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
-        if not isinstance(level_of_detail, Real) or isinstance(level_of_detail, bool):
-            raise TypeError(f"level_of_detail: expected a number, got {level_of_detail!r}")
-        if not 0 <= level_of_detail <= 4:
-            raise ValueError(f"level_of_detail: expected 0 to 4, got {level_of_detail}")
         self.lens = lens
         self.aperture = parse_aperture(aperture)
         self.views = _whole("views", views, 1)
+        if level_of_detail == "auto":
+            level_of_detail = min(1.0, 2 / views)
+        if not isinstance(level_of_detail, Real) or isinstance(level_of_detail, bool):
+            raise TypeError(f"level_of_detail: expected a number or 'auto', got {level_of_detail!r}")
+        if not 0 <= level_of_detail <= 1:
+            raise ValueError(f"level_of_detail: expected a share from 0 to 1, got {level_of_detail}")
         self.level_of_detail = float(level_of_detail)
         self.reuse = _whole("reuse", reuse, 0)
         self.subsamples = _whole("subsamples", subsamples, 0)
@@ -105,8 +116,8 @@ class AccumulationBuffer(nn.Module):
             motion: of the layers ``(B, L, 2, H, W)``, the way (dx, dy) in px over the open shutter.
 
         Returns:
-            ``(B, 4, H, W)`` premultiplied RGBA, with ``B = 1`` for a scene. That of layers is differentiable to the
-            layers, their depth, their motion and the lens.
+            ``(B, 4, H, W)`` premultiplied RGBA, with ``B = 1`` for a scene. That of layers has their dtype and is
+            differentiable to the layers, their depth, their motion and the lens.
 
         Raises:
             TypeError: an argument of the wrong kind.
@@ -123,27 +134,16 @@ class AccumulationBuffer(nn.Module):
             with torch.no_grad():
                 return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
         check_image("source", source, ("B", "L", 4, "H", "W"))
-        signed = self._signed(source, depth, coc)
+        signed = signed_coc(self.lens, source, depth, coc)
         if motion is not None:
             check_image("motion", motion, (*source.shape[:2], 2, *source.shape[3:]), like=source)
+            if not bool(motion.isfinite().all()):
+                raise ValueError(f"motion: expected finite ways, got {int((~motion.isfinite()).sum())} that are not")
         dtype = compute_dtype(source, signed)
         layers, radii = source.to(dtype), signed.to(dtype)
         moved = None if motion is None else motion.to(dtype)
-        return accumulate_layers(layers, radii, moved, views, level_of_detail=self.level_of_detail, **settings)
-
-    def _signed(self, layers: Tensor, depth: Camera | Tensor | None, coc: Tensor | None) -> Tensor:
-        """The signed CoC of layers."""
-        if (depth is None) == (coc is None):
-            raise ValueError("depth: expected either depth or coc, got " + ("both" if coc is not None else "neither"))
-        name, value = ("depth", depth) if coc is None else ("coc", coc)
-        checked = check_image(name, value, (*layers.shape[:2], 1, *layers.shape[3:]), like=layers)
-        if coc is None:
-            if self.lens is None:
-                raise ValueError("depth: expected coc, since this AccumulationBuffer has no lens, got depth")
-            return self.lens.coc(checked, layers.shape[-1])
-        if not bool(checked.isfinite().all()):
-            raise ValueError(f"coc: expected finite radii, got {int((~checked.isfinite()).sum())} that are not")
-        return checked
+        out = accumulate_layers(layers, radii, moved, views, level_of_detail=self.level_of_detail, **settings)
+        return out.to(source.dtype)
 
 
 def _whole(name: str, value: int, low: int) -> int:

@@ -5,8 +5,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.layers import continued
+from torchbokeh.ops.planes import pixel_centres
 from torchbokeh.ops.raycast import subsample_blur
-from torchbokeh.views import Views, detail_levels, shared_views, smallest_radius, subsample_offsets
+from torchbokeh.views import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
 
 STEPS = 4
 """Steps to the point that a view moves to a pixel; each leaves an error smaller by the slope of the parallax."""
@@ -39,8 +40,7 @@ class Layer:
     def view(self, lens: Tensor, time: float, level: int) -> tuple[Tensor, Tensor]:
         """The layer as one view has it: RGBA ``(B, 4, H, W)`` and its signed CoC ``(B, 1, H, W)``."""
         h, w = self.field.shape[2:]
-        like = {"dtype": self.field.dtype, "device": self.field.device}
-        y, x = torch.meshgrid(*(torch.arange(n, **like) + 0.5 for n in (h, w)), indexing="ij")
+        x, y = pixel_centres((h, w), self.field)
         pixel = torch.stack([x, y], -1).expand(len(self.field), h, w, 2)
         here, field = pixel, self.field
         # The point that comes to lie on a pixel solves `here + parallax(here) = pixel`.
@@ -70,7 +70,9 @@ def accumulate_layers(
     subsamples: int,
 ) -> Tensor:
     """The mean of the views ``(B, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
-    count = layers.shape[1]
+    b, count, _, h, w = layers.shape
+    if layers.numel() == 0:
+        return layers.new_zeros(b, 4, h, w)
     offsets, scale = subsample_offsets(views.lens.detach(), subsamples)
     # The pixels of the input are means already: shifting them would only blur them once more.
     views = Views(views.lens * (scale if subsamples else 1.0), views.time, torch.zeros_like(views.shift))
@@ -90,7 +92,7 @@ def accumulate_layers(
     parents = torch.arange(len(views))[:, None].expand_as(level)
     if reuse:
         still = Views(views.lens.detach().cpu(), views.time, views.shift.cpu())
-        parents = shared_views(still, torch.maximum(low.abs(), high.abs()), speed, reuse, level)
+        parents = shared_views(still, largest_coc(low, high), speed, reuse, level)
     ready = [
         Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
         for i, k in enumerate(kept)
@@ -103,16 +105,18 @@ def accumulate_layers(
         picture, front, most_seen = torch.zeros_like(total), torch.zeros_like(left), torch.zeros_like(left)
         for i, layer in enumerate(ready):
             key = (i, int(parents[v, i]))
-            rgba, radius = copies.pop(key, None) or layer.view(
-                views.lens[key[1]].to(layers), float(views.time[key[1]]), int(level[key[1], i])
-            )
-            if last[key] > v:
-                copies[key] = rgba, radius
+            if key not in copies:
+                copies[key] = layer.view(
+                    views.lens[key[1]].to(layers), float(views.time[key[1]]), int(level[key[1], i])
+                )
+            rgba, radius = copies[key]
+            if last[key] == v:
+                del copies[key]
             picture = picture + left * rgba
             if subsamples:
                 visible = left * rgba[:, 3:]
                 front = torch.where(visible > most_seen, radius, front)
                 most_seen = torch.maximum(most_seen, visible)
             left = left * (1 - rgba[:, 3:])
-        total = total + (subsample_blur(picture, front, offsets) if subsamples else picture)
+        total = total + (subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture)
     return total / len(views)

@@ -5,6 +5,7 @@ from numbers import Real
 import torch
 from torch import Tensor, nn
 
+from torchbokeh._signed import signed_coc, signed_map
 from torchbokeh.layers import FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
@@ -210,10 +211,7 @@ class LensBlur(nn.Module):
         """Check everything; return the background with its CoC, the signed CoC, and where ``max_coc`` cut it."""
         layered = isinstance(image, Tensor) and image.dim() == 5
         check_image("image", image, ("B", "L", 4, "H", "W") if layered else ("B", "C", "H", "W"))
-        if (depth is None) == (coc is None):
-            raise ValueError("depth: expected either depth or coc, got " + ("both" if coc is not None else "neither"))
-        name, value = ("depth", depth) if coc is None else ("coc", coc)
-        signed = self._signed(name, value, image, is_coc=coc is not None)
+        signed = signed_coc(self.lens, image, depth, coc)
         limit = self.max_coc
         cut = torch.zeros_like(signed, dtype=torch.bool) if limit is None else signed.abs() > limit
         signed = signed if limit is None else signed.clamp(-limit, limit)
@@ -227,20 +225,9 @@ class LensBlur(nn.Module):
         colour, behind = pair
         check_image("background", colour, tuple(image.shape), like=image)
         if behind is not None:
-            behind = self._signed("background[1]", behind, image, is_coc=coc is not None)
+            behind = signed_map(self.lens, image, "background[1]", behind, is_coc=coc is not None)
             behind = behind if limit is None else behind.clamp(-limit, limit)
         return (colour, behind), signed, cut
-
-    def _signed(self, name: str, value: Tensor | None, image: Tensor, *, is_coc: bool) -> Tensor:
-        """The signed CoC of a map of depth or of CoC."""
-        checked = check_image(name, value, (*image.shape[:-3], 1, *image.shape[-2:]), like=image)
-        if not is_coc:
-            if self.lens is None:
-                raise ValueError(f"{name}: expected coc, since this LensBlur has no lens, got depth")
-            return self.lens.coc(checked, image.shape[-1])
-        if not torch.compiler.is_compiling() and not bool(checked.isfinite().all()):
-            raise ValueError(f"{name}: expected finite radii, got {int((~checked.isfinite()).sum())} that are not")
-        return checked
 
     @staticmethod
     def _check_plan(plan: Plan, image: Tensor, background: Background) -> None:

@@ -43,10 +43,15 @@ def smallest_radius(low: Tensor, high: Tensor) -> Tensor:
     return torch.where(low * high <= 0, 0.0, torch.minimum(low.abs(), high.abs()))
 
 
-def detail_levels(radius: Tensor, texel: Tensor, scale: float, count: int, most: Tensor) -> Tensor:
+def largest_coc(low: Tensor, high: Tensor) -> Tensor:
+    """The signed CoC that is largest in size within each range."""
+    return torch.where(high.abs() >= low.abs(), high, low)
+
+
+def detail_levels(radius: Tensor, texel: Tensor, share: float, count: int, most: Tensor) -> Tensor:
     """The level of detail of every object in every view (section 3.2 of the defocus and bokeh dissertation).
 
-    ``L = scale * max(log_s(C / A), 0)``, with C the area of the smallest CoC of the object, A that of one of its
+    ``L = max(log_s(share * C / A), 0)``, with C the area of the smallest CoC of the object, A that of one of its
     texels on the screen, and s = 4: a level has a quarter of the texels of the one before. The two levels beside L
     share the views: of ``L = 2.3`` the first 70 % look at level 2 and the rest at level 3, and as any run of Halton
     points is spread evenly, nothing pops while L changes.
@@ -54,31 +59,32 @@ def detail_levels(radius: Tensor, texel: Tensor, scale: float, count: int, most:
     Args:
         radius: ``(K,)`` smallest CoC radius in px.
         texel: ``(K,)`` area of a texel in px²; 0 where it is not known, which gives level 0.
-        scale: 1 as in the text; less is finer.
+        share: of the CoC's area that a texel may cover: 1 as in the text, less is finer.
         count: number of views N.
         most: ``(K,)`` the coarsest level there is.
 
     Returns:
         ``(N, K)`` int64.
     """
-    ratio = torch.where(texel > 0, torch.pi * radius**2 / texel.clamp_min(1e-30), 1.0)
-    level = (scale * ratio.clamp_min(1).log2() / 2).clamp(max=most.to(ratio.dtype))
+    ratio = torch.where(texel > 0, share * torch.pi * radius**2 / texel.clamp_min(1e-30), 1.0)
+    level = (ratio.clamp_min(1).log2() / 2).clamp(max=most.to(ratio.dtype))
     fine = level.floor()
     views = torch.arange(count, dtype=level.dtype)[:, None]
     coarser = views >= ((1 - (level - fine)) * count).round()
     return (fine + coarser.to(fine.dtype)).long()
 
 
-def shared_views(views: Views, radius: Tensor, motion: Tensor, grid: int, level: Tensor) -> Tensor:
+def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Tensor) -> Tensor:
     """Which view each object is taken from in each view (section 3.3 of the dissertation).
 
     Views in which an object comes to lie on the same raster cell share one rendering of it: that of the parent, the
     one nearest to the middle of the cell. The place of an object is its largest CoC times the lens point, and the
-    sub-pixel shift of the view; its motion is a third dimension. Levels of detail are kept apart.
+    sub-pixel shift of the view; its motion is a third dimension. Levels of detail are kept apart. The CoC is signed,
+    for what is in front of the focus goes against the lens point.
 
     Args:
         views: N of them.
-        radius: ``(K,)`` largest CoC radius in px.
+        coc: ``(K,)`` signed CoC in px, where it is largest.
         motion: ``(K,)`` the longest way of the object while the shutter is open, in px.
         grid: cells per pixel and direction: 1 as in the text, 2 its finer grid.
         level: ``(N, K)``.
@@ -88,7 +94,7 @@ def shared_views(views: Views, radius: Tensor, motion: Tensor, grid: int, level:
     """
     parents = torch.empty_like(level)
     for k in range(level.shape[1]):
-        lens = radius[k] * views.lens + views.shift
+        lens = coc[k] * views.lens + views.shift
         place = grid * torch.cat([lens, (motion[k] * views.time)[:, None]], 1)
         cell = place.round()
         _, member = torch.cat([cell, level[:, k : k + 1]], 1).unique(dim=0, return_inverse=True)

@@ -191,7 +191,7 @@ def test_what_a_call_refuses(arguments: dict[str, Any], error: type[Exception], 
 
 
 def test_depth_needs_a_lens() -> None:
-    with pytest.raises(ValueError, match="depth: expected coc, since this LensBlur has no lens, got depth"):
+    with pytest.raises(ValueError, match="depth: expected coc, since there is no lens, got depth"):
         LensBlur()(IMAGE, DEPTH)
 
 

@@ -30,7 +30,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             anything in it; ``None`` for 1 % to 8 % of the width.
         views: of the target. Highlights want thousands, other things hundreds.
         layers: L; what lies deeper is flattened into the last one.
-        level_of_detail: as for `torchbokeh.AccumulationBuffer`.
+        level_of_detail: as for `torchbokeh.AccumulationBuffer`; ``"auto"`` takes the grain from pictures of few views.
         reuse: as for `torchbokeh.AccumulationBuffer`.
 
     Raises:
@@ -53,8 +53,8 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         blur: tuple[float, float] | None = None,
         views: int = 256,
         layers: int = 6,
-        level_of_detail: float = 0.0,
-        reuse: int = 2,
+        level_of_detail: float | str = "auto",
+        reuse: int = 0,
     ) -> None:
         rng(seed)
         self.seed = seed

@@ -1,11 +1,12 @@
 """Scenes of textured cards, and the pinhole picture that a renderer starts from."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.planes import Plates, render_planes
+from torchbokeh.ops.planes import Plates, pixel_centres, render_planes
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.layering import Fragments, stack_layers
 from torchbokeh.scenes.sprite import Backdrop, Sprite, place
@@ -130,7 +131,7 @@ class Scene:
             level = torch.full((len(grid), 1), lod)
             rgba, _ = render_planes(one, inverse3(several)[:, None], level, (bottom - top, right - left))
             if bool((rgba[0, 3] > 0).any()):
-                depth, motion = _geometry(three, rgba, one.infinite[0])
+                depth, motion = _geometry(three, rgba, one)
                 found.append(Fragments(top, left, rgba[0], depth, motion))
         return found
 
@@ -144,8 +145,9 @@ def shifted(homography: Tensor, shift: Tensor) -> Tensor:
 
 def _box(homography: Tensor, plate: Plates, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Rows and columns of the picture that may show a card: top, left, bottom, right; all of it where in doubt."""
-    h, w = plate.levels[0][0].shape[1:]
-    rim = 0.5 * 2.0 ** (len(plate.levels[0]) - 1)
+    texel = 2.0 ** (len(plate.levels[0]) - 1)
+    h, w = (n * texel for n in plate.levels[0][-1].shape[1:])  # a level of odd size may end beyond level 0
+    rim = 0.5 * texel
     x0, x1, y0, y1 = -rim, w + rim, -rim, h + rim
     corners = torch.tensor([[x0, y0, 1], [x1, y0, 1], [x1, y1, 1], [x0, y1, 1]], dtype=torch.float64)
     points = corners @ homography.mT
@@ -160,16 +162,25 @@ def _box(homography: Tensor, plate: Plates, size: tuple[int, int]) -> tuple[int,
     return top, clipped((x.min() - 1).floor(), size[1]), bottom, clipped((x.max() + 1).ceil(), size[1])
 
 
-def _geometry(matrices: Tensor, rgba: Tensor, infinite: bool) -> tuple[Tensor, Tensor]:
+def _corners(texture: Tensor, rim: float) -> Tensor:
+    """Corners ``(4, 3)`` of a card in texture coordinates ``(s, t, 1)``, and of ``rim`` texels around it."""
+    h, w = texture.shape[1:]
+    x0, x1, y0, y1 = -rim, w + rim, -rim, h + rim
+    return torch.tensor([[x0, y0, 1], [x1, y0, 1], [x1, y1, 1], [x0, y1, 1]], dtype=torch.float64)
+
+
+def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Tensor]:
     """Depth and motion of a card at the centres of the pixels, from its homographies half way, before and after."""
     h, w = rgba.shape[2:]
-    if infinite:
+    if plate.infinite[0]:
         return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(2, h, w)
     middle, opening, closing = matrices
-    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (h, w)), indexing="ij")
+    x, y = pixel_centres((h, w), middle)
     s, t, inverse_depth = torch.einsum("ij,jyx->iyx", inverse3(middle), torch.stack([x, y, torch.ones_like(x)]))
-    # A pixel that holds some of a card while its centre looks past the card's horizon: as good as infinitely far.
-    inverse_depth = inverse_depth.clamp_min(1e-9)
+    # The centre of a pixel that holds some of a card may look past the card, even past its horizon.
+    corners = _corners(plate.levels[0][0], 0.0) @ middle[2]
+    near, far = float(corners.min()), float(corners.max())
+    inverse_depth = inverse_depth.clamp(1 / far if far > 0 else 1e-9, 1 / near if near > 0 else torch.inf)
     depth = inverse_depth.reciprocal()[None]
     if torch.equal(opening, closing):
         return depth.to(rgba), rgba.new_zeros(2, h, w)
@@ -181,17 +192,16 @@ def _geometry(matrices: Tensor, rgba: Tensor, infinite: bool) -> tuple[Tensor, T
 
 def _minified(homography: Tensor, plate: Plates, samples: int) -> int:
     """The level whose texels are about as far apart as the points of a pixel: finer ones would only be missed."""
-    return max(0, int(torch.log2(1 / (samples * texel_area(homography, plate.levels[0][0]).sqrt().clamp_min(1e-9)))))
+    area = float(texel_area(homography, plate.levels[0][0]))
+    return max(0, int(-math.log2(samples * math.sqrt(area)))) if area > 0 else 0
 
 
 def texel_area(homography: Tensor, texture: Tensor) -> Tensor:
     """Area in px² that a texel covers on the screen, on the average over the card; 0 where that can't be said."""
-    h, w = texture.shape[1:]
-    corners = torch.tensor([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]], dtype=torch.float64)
-    x, y, z = (corners @ homography.mT).unbind(-1)
+    x, y, z = (_corners(texture, 0.0) @ homography.mT).unbind(-1)
     x, y = x / z, y / z
     area = 0.5 * (x * y.roll(-1, -1) - y * x.roll(-1, -1)).sum(-1).abs()
-    return torch.where((z > 0).all(-1), area, 0.0) / (h * w)
+    return torch.where((z > 0).all(-1), area, 0.0) / texture[0].numel()
 
 
 def inverse3(matrix: Tensor) -> Tensor:

@@ -92,6 +92,8 @@ def _check_texture(texture: Tensor, channels: int) -> None:
         raise ValueError(f"texture: expected at least one texel, got shape {tuple(texture.shape)}")
     if not bool(((texture >= 0) & texture.isfinite()).all()):
         raise ValueError("texture: expected finite radiance, 0 or more, got other values")
+    if bool((texture[3:] > 1 + 1e-6).any()):
+        raise ValueError(f"texture: expected coverage from 0 to 1, got {float(texture[3].max()):g}")
 
 
 def place(sprites: Sequence[Sprite], backdrop: Backdrop | None, times: Tensor) -> Tensor:

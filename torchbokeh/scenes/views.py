@@ -9,7 +9,7 @@ from torchbokeh.ops.planes import Plates, render_planes
 from torchbokeh.ops.raycast import subsample_blur
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3, texel_area
-from torchbokeh.views import Views, detail_levels, shared_views, smallest_radius, subsample_offsets
+from torchbokeh.views import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
 
 CHUNK = 16
 """Frames held at a time while they wait for their sub-samples."""
@@ -46,7 +46,7 @@ def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
     depth = torch.where(torch.tensor(plates.infinite), torch.inf, depth)
     # What reaches behind the lens has no bound: the blur goes to infinity there.
     inside = depth > 0
-    coc = camera.lens.coc(torch.where(inside, depth, 1e-6), camera.size[1])
+    coc = _coc(camera, torch.where(inside, depth, 1e-6))
     flat = coc.reshape(-1, len(plates.levels))
     motion = (place - place[1]).norm(dim=-1).amax((0, 1)) * 2
     motion = torch.where(inside.all(1).all(0), motion, torch.inf)
@@ -59,6 +59,8 @@ def accumulate_scene(
     scene: Scene, camera: Camera, views: Views, *, level_of_detail: float, reuse: int, subsamples: int
 ) -> Tensor:
     """The mean of the views ``(1, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
+    if len(scene) == 0:
+        return torch.zeros(1, 4, *camera.size)
     plates = scene.plates()
     seen = bounds(scene, plates, camera)
     count = len(views)
@@ -71,13 +73,14 @@ def accumulate_scene(
         views = Views(views.lens * scale, views.time, views.shift)
     parents = None
     if reuse:
-        parents = shared_views(views, torch.maximum(seen.low.abs(), seen.high.abs()), seen.motion, reuse, level)
+        parents = shared_views(views, largest_coc(seen.low, seen.high), seen.motion, reuse, level)
     inverse = inverse3(scene.homographies(camera, views.lens, views.time, views.shift))
     if not subsamples:
         return render_planes(plates, inverse, level, camera.size, parents=parents)[0]
     sky = scene.backdrop is None or bool(plates.infinite[-1])
-    total = torch.zeros(1, 4, *camera.size)
-    limit = camera.lens.coc(torch.full((1, 1), torch.inf), camera.size[1])
+    texels = plates.levels[0][0]
+    total = torch.zeros(1, 4, *camera.size, device=texels.device)
+    limit = _coc(camera, torch.full((1, 1), torch.inf))
     for start in range(0, count, CHUNK):
         part = slice(start, start + CHUNK)
         own, lod, shared = inverse[part], level[part], None
@@ -87,7 +90,7 @@ def accumulate_scene(
             # Of the views of this part, the first with the same parent.
             shared = (chosen[:, None] == chosen).int().argmax(0)
         frames, nearest = render_planes(plates, own, lod, camera.size, parents=shared, frames=True)
-        coc = camera.lens.coc(nearest.reciprocal(), camera.size[1])
+        coc = _coc(camera, nearest.reciprocal())
         background = None
         if sky:
             background = torch.zeros_like(frames)
@@ -95,5 +98,11 @@ def accumulate_scene(
                 last = Plates(plates.levels[-1:], plates.mirror[-1:], plates.infinite[-1:])
                 background = render_planes(last, inverse[part, -1:], level[part, -1:], camera.size, frames=True)[0]
         far = float(limit) - 1e-4 if sky else torch.inf  # 1e-4 px from the blur of infinity is infinity
-        total = total + subsample_blur(frames, coc, offsets, far=far, background=background).sum(0, keepdim=True)
-    return total / count
+        blurred = subsample_blur(frames, coc, offsets.to(frames.device), far=far, background=background)
+        total = total + blurred.sum(0, keepdim=True)
+    return (total / count).to(texels.dtype)
+
+
+def _coc(camera: Camera, depth: Tensor) -> Tensor:
+    """Signed CoC in px, where the depth is, wherever the lens is."""
+    return camera.lens.coc(depth.to(camera.lens.focus_distance.device), camera.size[1]).to(depth.device)
