@@ -115,7 +115,8 @@ def accumulate_layers(
             picture = picture + left * rgba
             if subsamples:
                 visible = left * rgba[:, 3:]
-                front = torch.where(visible > most_seen, radius, front)
+                # Where nothing is seen, the last layer stands for it: no surface in focus that hides what is blurred
+                front = torch.where(visible >= most_seen, radius, front)
                 most_seen = torch.maximum(most_seen, visible)
             left = left * (1 - rgba[:, 3:])
         total = total + (subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture)
