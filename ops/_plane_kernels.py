@@ -163,7 +163,7 @@ def _render_band(  # type: ignore[no-untyped-def]
                             s = (lines[k, 0] + lines[k, 1] * x) * scale
                             t = (lines[k, 2] + lines[k, 3] * x) * scale
                             # Rounding at the end of an interval; NaN fails too.
-                            if not (z > 0.0 and abs(s) < 1e9 and abs(t) < 1e9):
+                            if not (z > 0.0 and abs(s) < 1e15 and abs(t) < 1e15):
                                 continue
                             lod = level[v, k]
                             tall, wide = sizes[k, lod, 1], sizes[k, lod, 0]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.lens import ThinLens
+from torchbokeh.scenes._random import check_size
 
 
 @dataclass(frozen=True)
@@ -22,13 +23,13 @@ class Camera:
         shutter: how long it stays open, in seconds, >= 0; the time 0 of the scene is half way.
 
     Raises:
-        TypeError: ``lens`` is no `ThinLens`.
+        TypeError: ``lens`` is no `ThinLens`, or ``size`` not two integers.
         ValueError: a batched lens, an empty picture, a negative shutter time.
 
     Example:
         >>> from torchbokeh import ThinLens
         >>> camera = Camera(ThinLens(0.05, 2.0, torch.inf, sensor_width=0.036), size=(240, 360))
-        >>> round(camera.focal_px, 6)
+        >>> round(camera.focal_px, 3)
         500.0
     """
 
@@ -42,8 +43,7 @@ class Camera:
         for name, value in self.lens._values().items():
             if value.dim():
                 raise ValueError(f"lens: expected scalar parameters, got {name} of shape {tuple(value.shape)}")
-        if len(self.size) != 2 or not all(isinstance(n, int) and n > 0 for n in self.size):
-            raise ValueError(f"size: expected (H, W) of at least one pixel, got {self.size}")
+        object.__setattr__(self, "size", check_size(self.size))
         if not 0 <= self.shutter < float("inf"):
             raise ValueError(f"shutter: expected seconds, 0 or more, got {self.shutter}")
 

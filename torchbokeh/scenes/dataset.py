@@ -1,6 +1,8 @@
 """Training data without end: pictures, depth, motion and layers with the exact picture a camera would take."""
 
+import sys
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -8,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchbokeh.accumulation import AccumulationBuffer
-from torchbokeh.scenes._random import check_size, rng
+from torchbokeh.scenes._random import check_size, count_setting, rng
 from torchbokeh.scenes.recipes import RECIPES
 
 
@@ -24,7 +26,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
     Args:
         seed: of the whole set, >= 0.
         resolution: ``(H, W)`` of the pictures.
-        length: number of samples.
+        length: number of samples; there is no end to them, but a shuffling sampler lists them all.
         recipes: names from `torchbokeh.scenes.RECIPES`, each as likely; ``None`` for all of them.
         blur: smallest and largest blur of a sample in px, where the blur of a sample is the largest CoC radius of
             anything in it; ``None`` for 1 % to 8 % of the width.
@@ -34,6 +36,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         reuse: as for `torchbokeh.AccumulationBuffer`.
 
     Raises:
+        TypeError: an argument of the wrong kind.
         ValueError: a value out of its range, or an unknown recipe.
 
     Example:
@@ -48,7 +51,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         seed: int = 0,
         resolution: tuple[int, int] = (256, 256),
         *,
-        length: int = 1 << 31,
+        length: int = 1 << 20,
         recipes: Sequence[str] | None = None,
         blur: tuple[float, float] | None = None,
         views: int = 256,
@@ -57,11 +60,9 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         reuse: int = 0,
     ) -> None:
         rng(seed)
-        self.seed = seed
+        self.seed = int(seed)
         self.resolution = check_size(resolution)
-        if length < 0:
-            raise ValueError(f"length: expected 0 or more, got {length}")
-        self.length = length
+        self.length = count_setting("length", length, 0, 0, sys.maxsize)
         self.recipes = tuple(RECIPES) if recipes is None else tuple(recipes)
         for name in self.recipes:
             if name not in RECIPES:
@@ -69,12 +70,13 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         if not self.recipes:
             raise ValueError("recipes: expected at least one, got none")
         width = self.resolution[1]
-        self.blur = (0.01 * width, 0.08 * width) if blur is None else (float(blur[0]), float(blur[1]))
+        pair = (0.01 * width, 0.08 * width) if blur is None else blur
+        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(r, Real) for r in pair):
+            raise TypeError(f"blur: expected (smallest, largest) radius in px, got {blur!r}")
+        self.blur = float(pair[0]), float(pair[1])
         if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):
             raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
-        if layers < 1:
-            raise ValueError(f"layers: expected at least 1, got {layers}")
-        self.layers = layers
+        self.layers = count_setting("layers", layers, 0, 1, sys.maxsize)
         self.buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
 
     def settings(self) -> dict[str, Any]:

@@ -180,7 +180,8 @@ def rain(seed: int = 0, size: tuple[int, int] = (256, 256), blur: float | None =
 def ramp(seed: int = 0, size: tuple[int, int] = (256, 256), blur: float | None = None) -> tuple[Scene, Camera]:
     """A floor that runs from the camera through the focus to a far wall, with things that stand on it."""
     s = Studio("ramp", seed, size, 2.2, blur)
-    ground, near, far = 0.5, 0.75, 8.0
+    near, far = 0.75, 8.0
+    ground = 0.55 * s.width(near) * s.size[0] / s.size[1]  # the picture begins a tenth behind the floor's near edge
     texels = s.texels(2.0)
     name = str(s.draw.choice(["checker", "brick", "dead_leaves"]))
     floor = torch.cat([textures.TEXTURES[name](texels, s.seed()), torch.ones(1, *texels)])

@@ -209,6 +209,9 @@ def inverse3(matrix: Tensor) -> Tensor:
     a, b, c = matrix.unbind(-2)
     cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -1)
     determinant = (a * cofactors[..., 0]).sum(-1)[..., None, None]
-    scale = matrix.norm(dim=-1).prod(-1)[..., None, None]
+    # A shift of the picture, as far as it may be, adds multiples of the last row to the others: it does not count.
+    unit = c / c.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    across = [(row - (row * unit).sum(-1, keepdim=True) * unit).norm(dim=-1) for row in (a, b)]
+    scale = (across[0] * across[1] * c.norm(dim=-1))[..., None, None]
     flat = determinant.abs() <= 1e-12 * scale
     return torch.where(flat, 0.0, cofactors / torch.where(flat, 1.0, determinant))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ class Sprite:
         emission: factor on the radiance: a lamp is a card with a large one. Coverage stays.
 
     Raises:
-        TypeError: ``texture`` is not a floating-point tensor.
+        TypeError: ``texture`` is not a floating-point tensor, or a tuple holds no numbers.
         ValueError: a shape or a number that does not fit.
 
     Example:
@@ -48,10 +49,10 @@ class Sprite:
     def __post_init__(self) -> None:
         _check_texture(self.texture, 4)
         for name in ("position", "rotation", "velocity", "angular_velocity"):
-            value = getattr(self, name)
+            value = _numbers(name, getattr(self, name))
             if len(value) != 3 or not all(math.isfinite(v) for v in value):
                 raise ValueError(f"{name}: expected three finite numbers, got {value}")
-        if len(self.size) != 2 or not all(0 < v < math.inf for v in self.size):
+        if len(_numbers("size", self.size)) != 2 or not all(0 < v < math.inf for v in self.size):
             raise ValueError(f"size: expected a width and a height above 0 in metres, got {self.size}")
         if not 0 <= self.emission < math.inf:
             raise ValueError(f"emission: expected a factor, 0 or more, got {self.emission}")
@@ -84,6 +85,12 @@ class Backdrop:
             raise ValueError(f"distance: expected metres above 0, or inf, got {self.distance}")
         if not 0 < self.width < math.inf:
             raise ValueError(f"width: expected a width above 0 for each metre of distance, got {self.width}")
+
+
+def _numbers(name: str, value: object) -> Sequence[float]:
+    if not isinstance(value, Sequence) or not all(isinstance(v, Real) for v in value):
+        raise TypeError(f"{name}: expected a tuple of numbers, got {value!r}")
+    return value
 
 
 def _check_texture(texture: Tensor, channels: int) -> None:
