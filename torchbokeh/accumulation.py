@@ -2,7 +2,6 @@
 
 from numbers import Real
 
-import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc
@@ -131,8 +130,7 @@ class AccumulationBuffer(nn.Module):
             for name, value in (("coc", coc), ("motion", motion)):
                 if value is not None:
                     raise ValueError(f"{name}: expected None for a scene, which has its own, got a tensor")
-            with torch.no_grad():
-                return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
+            return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
         check_image("source", source, ("B", "L", 4, "H", "W"))
         signed = signed_coc(self.lens, source, depth, coc)
         if motion is not None:

@@ -73,7 +73,7 @@ def accumulate_layers(
     b, count, _, h, w = layers.shape
     if layers.numel() == 0:
         return layers.new_zeros(b, 4, h, w)
-    offsets, scale = subsample_offsets(views.lens.detach(), subsamples)
+    offsets, scale = subsample_offsets(views.lens, subsamples)
     # The pixels of the input are means already: shifting them would only blur them once more.
     views = Views(views.lens * (scale if subsamples else 1.0), views.time, torch.zeros_like(views.shift))
     with torch.no_grad():

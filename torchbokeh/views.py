@@ -74,6 +74,7 @@ def detail_levels(radius: Tensor, texel: Tensor, share: float, count: int, most:
     return (fine + coarser.to(fine.dtype)).long()
 
 
+@torch.no_grad()
 def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Tensor) -> Tensor:
     """Which view each object is taken from in each view (section 3.3 of the dissertation).
 
@@ -107,6 +108,7 @@ def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Te
     return parents
 
 
+@torch.no_grad()
 def subsample_offsets(lens: Tensor, count: int) -> tuple[Tensor, float]:
     """Sub-samples around every view's lens point (section 3.4 of the dissertation).
 

@@ -32,6 +32,7 @@ class Bounds:
     texel: Tensor
 
 
+@torch.no_grad()
 def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
     """Bounds from the corners of the cards when the shutter opens, half way and when it closes."""
     times = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
@@ -103,6 +104,7 @@ def accumulate_scene(
     return (total / count).to(texels.dtype)
 
 
+@torch.no_grad()
 def _coc(camera: Camera, depth: Tensor) -> Tensor:
     """Signed CoC in px, where the depth is, wherever the lens is."""
     return camera.lens.coc(depth.to(camera.lens.focus_distance.device), camera.size[1]).to(depth.device)

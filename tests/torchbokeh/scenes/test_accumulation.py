@@ -412,3 +412,17 @@ def test_odd_scenes(settings: dict[str, float]) -> None:
     assert float(seen["floor through the lens"][0, 3, -1].min()) == 1.0
     assert float(seen["floor through the lens"][0, 3, :8].max()) == 0.0
     assert float(seen["backdrop alone"][:, 3].min()) > 1 - 1e-6
+
+
+@pytest.mark.parametrize("settings", [{}, {"level_of_detail": 0.5, "reuse": 1, "subsamples": 2}], ids=str)
+def test_gradient_reaches_the_textures(settings: dict[str, float]) -> None:
+    wall = Backdrop(texture(3, 4, 4, 1).double(), 4.0)
+    focus = torch.nn.Parameter(torch.tensor(1.5))  # one that is being learned elsewhere is no obstacle
+    look = Camera(ThinLens(0.05, 0.5, focus, 0.036), (6, 8))
+
+    def render(rgba: Tensor) -> Tensor:
+        card = Sprite(rgba, (0.0, 0.0, 2.0), (0.8, 0.8), (0.1, 0.3, 0.0))
+        return AccumulationBuffer(views=3, **settings)(Scene((card,), wall), look)
+
+    rgba = (0.2 + 0.5 * texture(4, 5, 5, 0, 1.0)).double().requires_grad_()
+    assert torch.autograd.gradcheck(render, (rgba,), fast_mode=True)
