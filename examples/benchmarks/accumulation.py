@@ -180,7 +180,7 @@ def main() -> None:
             wide = ((24, 32), [4, 8], 16, 1) if args.tiny else ((288, 384), [8, 16, 32, 64, 128, 256, 512], 4096, 5)
             techniques(*wide, args.out)
         elif part == "samples":
-            samples(*(((24, 32), 4, 2) if args.tiny else ((256, 256), 256, 40)))
+            samples(*(((24, 32), 4, 2) if args.tiny else ((256, 256), 256, 20)))
         else:
             parser.error(f"--parts: expected floor, techniques and samples, got {part}")
 
