@@ -91,21 +91,21 @@ def _render_band(  # type: ignore[no-untyped-def]
             cuts[:] = False
             for m in range(count):
                 k = order[v, m]
-                h = inverse[v, k]
-                line = lines[k]
                 for c in range(3):
                     # The value at x = 0.5, the centre of the first pixel, and the step from pixel to pixel.
-                    line[2 * c] = h[c, 1] * centre + h[c, 2] + 0.5 * h[c, 0]
-                    line[2 * c + 1] = h[c, 0]
-                low, high = _cut(line[4], line[5], -1.0, float(width))
+                    step = inverse[v, k, c, 0]
+                    lines[k, 2 * c] = inverse[v, k, c, 1] * centre + inverse[v, k, c, 2] + 0.5 * step
+                    lines[k, 2 * c + 1] = step
+                start, slope = lines[k, 4], lines[k, 5]
+                low, high = _cut(start, slope, -1.0, float(width))
                 if not mirror[k]:
                     lod = level[v, k]
                     rim = 0.5 * (1 << lod)
                     for c in range(2):
-                        a, b = line[2 * c], line[2 * c + 1]
-                        low, high = _cut(a + rim * line[4], b + rim * line[5], low, high)
+                        a, b = lines[k, 2 * c], lines[k, 2 * c + 1]
+                        low, high = _cut(a + rim * start, b + rim * slope, low, high)
                         far = float(sizes[k, lod, c] << lod) + rim  # a level of odd size may end beyond level 0
-                        low, high = _cut(far * line[4] - a, far * line[5] - b, low, high)
+                        low, high = _cut(far * start - a, far * slope - b, low, high)
                         if low >= high:
                             break
                 if low < high:

@@ -279,6 +279,20 @@ def test_reuse_of_what_moves_and_of_frames_with_subsamples() -> None:
     torch.testing.assert_close(with_them, without, rtol=1e-5, atol=1e-6)
 
 
+def test_reuse_is_as_good_in_front_of_the_focus_as_behind_it() -> None:
+    # A card in front of the focus moves against the lens point, and its raster cells with it.
+    look = camera(1.0, 2.0)
+
+    def error(coc: float) -> float:
+        depth = float(look.lens.depth(torch.tensor([[coc]]), look.size[1]))
+        scene = Scene((Sprite(texture(4, 48, 64, 0, 1.0), (0.0, 0.0, depth), (0.6 * depth, 0.45 * depth)),))
+        brute, shared = (AccumulationBuffer(views=128, reuse=grid)(scene, look) for grid in (0, 2))
+        return rms(shared, brute)
+
+    for coc in (0.5, 0.65, 0.8):
+        assert 0 < error(-coc) < 1.5 * error(coc)
+
+
 def test_level_of_detail_does_not_pop(monkeypatch: pytest.MonkeyPatch) -> None:
     # The focus is pulled in small steps, through the levels 2.4 to 3.1 of a card of noise.
     scene = Scene((Sprite(texture(4, 64, 64, 0, 1.0), (0.0, 0.0, 2.0), (1.0, 1.0)),), Backdrop(plain(0.1, 0.1, 0.1)))
