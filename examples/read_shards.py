@@ -27,13 +27,14 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=16)
     parser.add_argument("--tiny", action="store_true", help="3 small samples, for tests")
     args = parser.parse_args()
+    out = args.out / "tiny" if args.tiny else args.out
     count, size, views = (3, (24, 32), 16) if args.tiny else (args.count, (192, 256), 256)
 
     dataset = ProceduralDataset(seed=0, resolution=size, length=count, views=views)
-    written = write_shards(dataset, args.out, count, per_shard=2, workers=0 if args.tiny else 2)
-    print(f"{args.out}: {len(written)} files written")
-    # Scenes have different numbers of layers, so samples come one by one.
-    for sample in DataLoader(read_shards(args.out), batch_size=None, num_workers=2):
+    written = write_shards(dataset, out, count, per_shard=2, workers=0 if args.tiny else 2)
+    print(f"{out}: {len(written)} files written")
+    # Each sample has a lens of its own, so they come one by one.
+    for sample in DataLoader(read_shards(out), batch_size=None, num_workers=2):
         if sample["index"] == 0:
             print(*(f"{key} {tuple(value.shape)}" for key, value in sample.items() if isinstance(value, Tensor)))
         blur = tb.LensBlur(tb.ThinLens(**sample["lens"]))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchbokeh.ops._checks import check_image
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NBuffers:
     """Minima and maxima over squares of ``2^i x 2^i`` pixels, for ``i = 0 .. L-1``.
 

@@ -20,7 +20,7 @@ SOLID = 1e-6
 """Once less light than this share passes, what lies behind is not looked at."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plates:
     """Textures of K rectangles, each with its coarser levels.
 

@@ -1,6 +1,6 @@
 """The reference renderer: the mean of many views through the lens while the shutter is open."""
 
-from numbers import Real
+from numbers import Integral, Real
 
 from torch import Tensor, nn
 
@@ -32,8 +32,10 @@ class AccumulationBuffer(nn.Module):
     * ``subsamples`` (3.4): every view is blurred once more over the lens around it, by casting rays through its own
       depth.
 
+    Memory does not grow with the number of views, but where a gradient is asked for: that keeps every view.
+
     Args:
-        lens: turns the depth of layers into signed CoC; not needed for scenes, whose camera has one.
+        lens: turns the depth of layers into signed CoC; ``None`` for scenes, whose camera has one.
         aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
         views: how many, N.
         level_of_detail: share of a CoC's area that one texel may cover: 0 is off, 1 as in the text, where texels
@@ -81,7 +83,7 @@ class AccumulationBuffer(nn.Module):
         self.aperture = parse_aperture(aperture)
         self.views = _whole("views", views, 1)
         if level_of_detail == "auto":
-            level_of_detail = min(1.0, 2 / views)
+            level_of_detail = min(1.0, 2 / self.views)
         if not isinstance(level_of_detail, Real) or isinstance(level_of_detail, bool):
             raise TypeError(f"level_of_detail: expected a number or 'auto', got {level_of_detail!r}")
         if not 0 <= level_of_detail <= 1:
@@ -115,8 +117,9 @@ class AccumulationBuffer(nn.Module):
             motion: of the layers ``(B, L, 2, H, W)``, the way (dx, dy) in px over the open shutter.
 
         Returns:
-            ``(B, 4, H, W)`` premultiplied RGBA, with ``B = 1`` for a scene. That of layers has their dtype and is
-            differentiable to the layers, their depth, their motion and the lens.
+            ``(B, 4, H, W)`` premultiplied RGBA, with ``B = 1`` for a scene. That of a scene is differentiable to its
+            textures and the aperture, not to the camera; that of layers to the layers, their depth, their motion, the
+            lens and the aperture.
 
         Raises:
             TypeError: an argument of the wrong kind.
@@ -126,11 +129,13 @@ class AccumulationBuffer(nn.Module):
         settings = {"reuse": self.reuse, "subsamples": self.subsamples}
         if isinstance(source, Scene):
             if not isinstance(depth, Camera):
-                raise TypeError(f"depth: expected the Camera of the scene, got {type(depth).__name__}")
-            for name, value in (("coc", coc), ("motion", motion)):
+                raise TypeError(f"depth: expected a Camera beside the scene, got {type(depth).__name__}")
+            for name, value in (("lens", self.lens), ("coc", coc), ("motion", motion)):
                 if value is not None:
-                    raise ValueError(f"{name}: expected None for a scene, which has its own, got a tensor")
+                    raise ValueError(f"{name}: expected None for a scene, got {type(value).__name__}")
             return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
+        if not isinstance(source, Tensor):
+            raise TypeError(f"source: expected a Scene, with its Camera, or layers, got {type(source).__name__}")
         check_image("source", source, ("B", "L", 4, "H", "W"))
         signed = signed_coc(self.lens, source, depth, coc)
         if motion is not None:
@@ -145,8 +150,10 @@ class AccumulationBuffer(nn.Module):
 
 
 def _whole(name: str, value: int, low: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not isinstance(value, Integral) or isinstance(value, bool):
         raise TypeError(f"{name}: expected an int, got {value!r}")
     if value < low:
         raise ValueError(f"{name}: expected at least {low}, got {value}")
-    return value
+    if value >= 1 << 62:
+        raise ValueError(f"{name}: expected below 2**62, got {value}")
+    return int(value)

@@ -1,5 +1,7 @@
 """Many views of layers: each is warped by the parallax of its own pixels."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -73,9 +75,14 @@ def accumulate_layers(
     b, count, _, h, w = layers.shape
     if layers.numel() == 0:
         return layers.new_zeros(b, 4, h, w)
+    if b > 1 and (level_of_detail or reuse):  # what an item may share or leave out does not depend on the others
+        moved = [None] * b if motion is None else motion.split(1)
+        settings: dict[str, Any] = {"level_of_detail": level_of_detail, "reuse": reuse, "subsamples": subsamples}
+        each = zip(layers.split(1), coc.split(1), moved, strict=True)
+        return torch.cat([accumulate_layers(*one, views, **settings) for one in each])
     offsets, scale = subsample_offsets(views.lens, subsamples)
     # The pixels of the input are means already: shifting them would only blur them once more.
-    views = Views(views.lens * (scale if subsamples else 1.0), views.time, torch.zeros_like(views.shift))
+    views = Views(views.lens * scale, views.time, torch.zeros_like(views.shift))
     with torch.no_grad():
         held = layers[:, :, 3:] > 0
         low = torch.where(held, coc, torch.inf).movedim(1, 0).flatten(1).amin(1).double().cpu()
@@ -91,8 +98,7 @@ def accumulate_layers(
         level = detail_levels(smallest_radius(low, high), torch.ones_like(low), level_of_detail, len(views), most)
     parents = torch.arange(len(views))[:, None].expand_as(level)
     if reuse:
-        still = Views(views.lens.detach().cpu(), views.time, views.shift.cpu())
-        parents = shared_views(still, largest_coc(low, high), speed, reuse, level)
+        parents = shared_views(views, largest_coc(low, high), speed, reuse, level)
     ready = [
         Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
         for i, k in enumerate(kept)

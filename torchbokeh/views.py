@@ -9,7 +9,7 @@ from torchbokeh.ops.sampling import aperture_points, halton, stratified
 from torchbokeh.ops.spans import Profile
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Views:
     """N views.
 
@@ -28,7 +28,8 @@ class Views:
     def spread(cls, count: int, profile: Profile, *, first: int = 0, seed: int | None = None) -> "Views":
         """Halton points: bases 2 and 7 over the lens, 3 over time, where they are stratified, 5 and 11 in the pixel."""
         points = halton(count, first=first, seed=seed)
-        return cls(aperture_points(profile, points[:, [0, 3]]), stratified(points[:, 1]) - 0.5, points[:, [2, 4]] - 0.5)
+        lens = aperture_points(profile, points[:, [0, 3]]).cpu()  # the aperture may be on another device
+        return cls(lens, stratified(points[:, 1]) - 0.5, points[:, [2, 4]] - 0.5)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -86,7 +87,7 @@ def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Te
     Args:
         views: N of them.
         coc: ``(K,)`` signed CoC in px, where it is largest.
-        motion: ``(K,)`` the longest way of the object while the shutter is open, in px.
+        motion: ``(K,)`` the greatest speed of the object, in px for the time that the shutter is open.
         grid: cells per pixel and direction: 1 as in the text, 2 its finer grid.
         level: ``(N, K)``.
 
@@ -95,6 +96,9 @@ def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Te
     """
     parents = torch.empty_like(level)
     for k in range(level.shape[1]):
+        if not (coc[k].isfinite() and motion[k].isfinite()):  # it may be anywhere: nothing is shared
+            parents[:, k] = torch.arange(len(level))
+            continue
         lens = coc[k] * views.lens + views.shift
         place = grid * torch.cat([lens, (motion[k] * views.time)[:, None]], 1)
         cell = place.round()
@@ -112,8 +116,10 @@ def shared_views(views: Views, coc: Tensor, motion: Tensor, grid: int, level: Te
 def subsample_offsets(lens: Tensor, count: int) -> tuple[Tensor, float]:
     """Sub-samples around every view's lens point (section 3.4 of the dissertation).
 
-    They fill a disc whose radius is the mean distance of a lens point from its nearest neighbour; the whole lens
-    where there is but one. The lens points are drawn in by the returned factor, so that the blur keeps its spread.
+    They fill a disc, whatever the aperture, whose radius is the mean distance of a lens point from its nearest
+    neighbour (the text's mean over all pairs would be most of the lens); the whole lens where there is but one point.
+    Other than in the text, the lens points are to be drawn in by the returned factor, so that the blur keeps its
+    spread.
 
     Args:
         lens: ``(N, 2)`` lens points.
@@ -122,14 +128,17 @@ def subsample_offsets(lens: Tensor, count: int) -> tuple[Tensor, float]:
     Returns:
         ``(S, 2)`` offsets from the lens point, with mean zero, and the factor.
     """
+    if count == 0:
+        return lens.new_zeros(0, 2), 1.0
     reach = 1.0
     if len(lens) > 1:
-        distance = torch.cdist(lens, lens).fill_diagonal_(torch.inf)
-        reach = float(distance.amin(1).mean())
+        from scipy.spatial import cKDTree
+
+        reach = float(cKDTree(lens.numpy()).query(lens.numpy(), k=2)[0][:, 1].mean())
     k = torch.arange(count, dtype=torch.float64)
     angle = k * (torch.pi * (3 - 5**0.5))  # a sunflower: even for any number
-    offsets = reach * ((k + 0.5) / max(count, 1)).sqrt()[:, None] * torch.stack([angle.cos(), angle.sin()], 1)
-    offsets = offsets - offsets.mean(0) if count else offsets
+    offsets = reach * ((k + 0.5) / count).sqrt()[:, None] * torch.stack([angle.cos(), angle.sin()], 1)
+    offsets = offsets - offsets.mean(0)
     if len(lens) == 1:
         return offsets, 0.0
     spread = float(offsets.square().sum()) / (count + 1)

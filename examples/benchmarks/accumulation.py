@@ -152,7 +152,7 @@ def samples(size: tuple[int, int], views: int, count: int) -> None:
     print("| technique | seconds of one core, median | slowest |\n| --- | --- | --- |")
     for method, settings in METHODS.items():
         data = ProceduralDataset(0, size, recipes=kinds)
-        data.buffer = AccumulationBuffer(views=views, **settings)
+        data.target = {"views": views, **settings}
         seconds = []
         for i in range(count):
             start = time.perf_counter()

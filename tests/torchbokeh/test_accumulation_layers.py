@@ -407,3 +407,15 @@ def test_small_pictures(settings: dict[str, Any]) -> None:
         assert out.shape == (2, 4, h, w)
         if h == w == 1:
             assert torch.allclose(out, flattened(layers), atol=1e-6)
+
+
+@pytest.mark.parametrize("settings", [{"level_of_detail": 1.0}, {"reuse": 1}, {"level_of_detail": 0.5, "reuse": 2}])
+def test_techniques_treat_every_item_of_a_batch_by_itself(settings):
+    layers, coc = (
+        torch.rand(2, 2, 4, 12, 16, generator=torch.Generator().manual_seed(0)).clamp(0.1, 1),
+        torch.tensor([9.0, 0.0]).view(2, 1, 1, 1, 1),
+    )
+    coc = coc.expand(2, 2, 1, 12, 16).contiguous()
+    buffer = tb.AccumulationBuffer(views=8, **settings)
+    alone = torch.cat([buffer(layers[n : n + 1], coc=coc[n : n + 1]) for n in (0, 1)])
+    assert torch.equal(buffer(layers, coc=coc), alone)

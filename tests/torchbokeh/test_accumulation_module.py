@@ -68,7 +68,7 @@ LAYERS, RADII = torch.ones(2, 3, 4, 5, 6), torch.ones(2, 3, 1, 5, 6)
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
-        ({"source": None}, TypeError, r"source: expected a tensor of shape \(B, L, 4, H, W\), got NoneType"),
+        ({"source": None}, TypeError, "source: expected a Scene, with its Camera, or layers, got NoneType"),
         ({"source": LAYERS[:, 0]}, ValueError, r"source: expected shape \(B, L, 4, H, W\), got \(2, 4, 5, 6\)"),
         ({"source": LAYERS.int()}, TypeError, "source: expected a floating-point tensor"),
         ({"coc": None}, ValueError, "depth: expected either depth or coc, got neither"),
@@ -81,7 +81,7 @@ LAYERS, RADII = torch.ones(2, 3, 4, 5, 6), torch.ones(2, 3, 1, 5, 6)
         ({"motion": RADII}, ValueError, r"motion: expected shape \(2, 3, 2, 5, 6\), got \(2, 3, 1, 5, 6\)"),
         ({"motion": LAYERS[:, :, :2].int()}, TypeError, "motion: expected a floating-point tensor"),
         ({"motion": LAYERS[:, :, :2] / 0}, ValueError, "motion: expected finite ways, got 360 that are not"),
-        ({"source": Scene(())}, TypeError, "depth: expected the Camera of the scene, got NoneType"),
+        ({"source": Scene(())}, TypeError, "depth: expected a Camera beside the scene, got NoneType"),
     ],
 )
 def test_layers_are_checked(given: dict[str, Any], error: type[Exception], message: str) -> None:
@@ -92,15 +92,23 @@ def test_layers_are_checked(given: dict[str, Any], error: type[Exception], messa
 
 def test_a_camera_goes_with_a_scene() -> None:
     lens = tb.ThinLens(0.05, 1.8, 2.0, sensor_width=0.036)
-    camera, buffer = Camera(lens, size=(6, 5)), tb.AccumulationBuffer(lens, views=2)
+    camera, buffer, free = (
+        Camera(lens, size=(6, 5)),
+        tb.AccumulationBuffer(lens, views=2),
+        tb.AccumulationBuffer(views=2),
+    )
     with pytest.raises(TypeError, match=r"depth: expected a tensor of shape .*, got Camera"):
         buffer(LAYERS, camera)
     for name in ("coc", "motion"):
-        with pytest.raises(ValueError, match=f"{name}: expected None for a scene, which has its own, got a tensor"):
-            buffer(Scene(()), camera, **{name: RADII})
+        with pytest.raises(ValueError, match=f"{name}: expected None for a scene, got Tensor"):
+            free(Scene(()), camera, **{name: RADII})
+    with pytest.raises(ValueError, match="lens: expected None for a scene, got ThinLens"):
+        buffer(Scene(()), camera)
+    with pytest.raises(TypeError, match="source: expected a Scene, with its Camera, or layers, got tuple"):
+        free((Scene(()), camera))
     with pytest.raises(ValueError, match="depth: expected values above 0"):
         buffer(LAYERS, RADII - 1)
-    assert torch.equal(buffer(Scene(()), camera), torch.zeros(1, 4, 6, 5))
+    assert torch.equal(free(Scene(()), camera), torch.zeros(1, 4, 6, 5))
 
 
 def test_examples_in_the_docstrings() -> None:

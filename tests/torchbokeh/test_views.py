@@ -247,3 +247,11 @@ def test_two_views_at_the_same_point() -> None:
 
 def test_examples_in_the_docstrings() -> None:
     assert doctest.testmod(torchbokeh.views).failed == 0
+
+
+def test_many_views_take_no_table_of_their_distances() -> None:
+    lens = Views.spread(1 << 16, Disc().profile()).lens  # 34 GB, that table
+    assert subsample_offsets(lens, 0)[0].shape == (0, 2)
+    offsets, factor = subsample_offsets(lens, 4)
+    assert float(offsets.norm(dim=1).max()) < 0.01
+    assert 0.999 < factor < 1

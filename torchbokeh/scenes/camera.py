@@ -1,6 +1,7 @@
 """The camera that looks at a scene."""
 
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ class Camera:
         shutter: how long it stays open, in seconds, >= 0; the time 0 of the scene is half way.
 
     Raises:
-        TypeError: ``lens`` is no `ThinLens`, or ``size`` not two integers.
+        TypeError: ``lens`` is no `ThinLens`, ``size`` not two integers, or ``shutter`` no number.
         ValueError: a batched lens, an empty picture, a negative shutter time.
 
     Example:
@@ -44,6 +45,8 @@ class Camera:
             if value.dim():
                 raise ValueError(f"lens: expected scalar parameters, got {name} of shape {tuple(value.shape)}")
         object.__setattr__(self, "size", check_size(self.size))
+        if not isinstance(self.shutter, Real):
+            raise TypeError(f"shutter: expected seconds, got {self.shutter!r}")
         if not 0 <= self.shutter < float("inf"):
             raise ValueError(f"shutter: expected seconds, 0 or more, got {self.shutter}")
 

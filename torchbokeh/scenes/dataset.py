@@ -1,5 +1,6 @@
 """Training data without end: pictures, depth, motion and layers with the exact picture a camera would take."""
 
+import operator
 import sys
 from collections.abc import Sequence
 from numbers import Real
@@ -16,6 +17,9 @@ from torchbokeh.scenes.recipes import RECIPES
 
 class ProceduralDataset(Dataset[dict[str, Any]]):
     """Samples of the recipes: sample i is a function of ``(seed, i)`` and the settings alone.
+
+    It is the same to the bit in every process and worker; on machines with other versions of torch, numpy and Pillow,
+    or without numba, to rounding.
 
     A sample is a dict of float32 tensors: ``image (3, H, W)``, the pinhole picture, linear; ``depth (1, H, W)`` in
     metres, ``inf`` is sky; ``motion (2, H, W)`` in px over the open shutter; ``coc (1, H, W)`` signed radius in px;
@@ -52,7 +56,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         resolution: tuple[int, int] = (256, 256),
         *,
         length: int = 1 << 20,
-        recipes: Sequence[str] | None = None,
+        recipes: Sequence[str] | str | None = None,
         blur: tuple[float, float] | None = None,
         views: int = 256,
         layers: int = 6,
@@ -63,7 +67,8 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         self.seed = int(seed)
         self.resolution = check_size(resolution)
         self.length = count_setting("length", length, 0, 0, sys.maxsize)
-        self.recipes = tuple(RECIPES) if recipes is None else tuple(recipes)
+        names = tuple(RECIPES) if recipes is None else recipes
+        self.recipes = (names,) if isinstance(names, str) else tuple(names)
         for name in self.recipes:
             if name not in RECIPES:
                 raise ValueError(f"recipes: expected some of {', '.join(RECIPES)}, got {name!r}")
@@ -77,20 +82,32 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):
             raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
         self.layers = count_setting("layers", layers, 0, 1, sys.maxsize)
-        self.buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
+        buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
+        self.target: dict[str, Any] = {
+            "views": buffer.views,
+            "level_of_detail": buffer.level_of_detail,
+            "reuse": buffer.reuse,
+        }
 
     def settings(self) -> dict[str, Any]:
         """All that the samples depend on, for a file beside them."""
         return {
             **{"seed": self.seed, "resolution": list(self.resolution), "recipes": list(self.recipes)},
-            **{"blur": list(self.blur), "views": self.buffer.views, "layers": self.layers},
-            **{"level_of_detail": self.buffer.level_of_detail, "reuse": self.buffer.reuse},
+            **{"blur": list(self.blur), "layers": self.layers},
+            **self.target,
         }
 
     def __len__(self) -> int:
         return self.length
 
+    def __repr__(self) -> str:
+        return f"ProceduralDataset({', '.join(f'{k}={v!r}' for k, v in self.settings().items())}, length={self.length})"
+
     def __getitem__(self, index: int) -> dict[str, Any]:
+        try:
+            index = operator.index(index)
+        except TypeError:
+            raise TypeError(f"index: expected an int, got {index!r}") from None
         if not -self.length <= index < self.length:
             raise IndexError(f"index: expected below {self.length}, got {index}")
         index %= self.length
@@ -102,7 +119,9 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         scene, camera = RECIPES[name](int(draw.integers(1 << 31)), self.resolution, float(blur))
         with torch.no_grad():
             seen = scene.render(camera, samples=4, layers=self.layers)
-            target = self.buffer(scene, camera)[0, :3]
+            # Views of its own for each sample: the same ones in all would be a pattern to learn.
+            buffer = AccumulationBuffer(**self.target, seed=int(draw.integers(1 << 31)))
+            target = buffer(scene, camera)[0, :3]
         for key, empty in (("layers", 0.0), ("layer_depth", torch.inf), ("layer_motion", 0.0)):
             seen[key] = _filled(seen[key], self.layers, empty)
         del seen["alpha"]

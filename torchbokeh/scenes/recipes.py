@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from numbers import Real
 
 import numpy as np
 import torch
@@ -28,6 +29,8 @@ class Studio:
     """
 
     def __init__(self, name: str, seed: int, size: tuple[int, int], focus: float, blur: float | None) -> None:
+        if blur is not None and (not isinstance(blur, Real) or isinstance(blur, bool)):
+            raise TypeError(f"blur: expected a radius in px or None, got {blur!r}")
         if blur is not None and not 0 <= blur < math.inf:
             raise ValueError(f"blur: expected a radius in px, 0 or more, or None, got {blur}")
         self.draw = rng(seed, name)
@@ -222,8 +225,8 @@ def sky(seed: int = 0, size: tuple[int, int] = (256, 256), blur: float | None = 
     h, w = s.size[0] * 5 // 4 + 1, s.size[1] * 5 // 4 + 1
     up = torch.linspace(0, 1, h)[None, :, None]
     blue, haze = torch.tensor([0.12, 0.3, 0.75])[:, None, None], torch.tensor([0.75, 0.8, 0.85])[:, None, None]
-    clouds = textures.noise((h, w), s.seed()).mean(0, keepdim=True)
-    clouds = ((clouds - clouds.mean()) / clouds.std().clamp_min(1e-6) - 0.3).clamp(0, 1)
+    grey = textures.noise((h, w), s.seed()).mean(0, keepdim=True).numpy()  # torch's sums depend on the threads
+    clouds = torch.from_numpy((grey - grey.mean()) / max(float(grey.std()), 1e-6) - 0.3).clamp(0, 1)
     picture = torch.lerp(torch.lerp(blue, haze, up).expand(3, h, w), torch.full((3, h, w), 1.1), 0.8 * clouds)
     return s.finish(Backdrop(picture, width=1.25 * s.width(1.0)))
 
@@ -232,6 +235,8 @@ def stack(
     seed: int = 0, size: tuple[int, int] = (256, 256), blur: float | None = None, *, count: int = 300
 ) -> tuple[Scene, Camera]:
     """Hundreds of small cards, one behind the other: what the number of things costs."""
+    if not isinstance(count, int) or count < 1:
+        raise ValueError(f"count: expected at least one card, got {count!r}")
     s = Studio("stack", seed, size, 2.5, blur)
     kinds = [s.card(0.15) for _ in range(12)]
     for depth in np.linspace(1 / 1.2, 1 / 12.0, count):

@@ -1,11 +1,14 @@
 """Scenes of textured cards, and the pinhole picture that a renderer starts from."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.planes import Plates, pixel_centres, render_planes
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.layering import Fragments, stack_layers
@@ -15,7 +18,7 @@ LEVELS = 16
 """Most levels of a texture: more than any texture has."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Cards in space before a backdrop: a world with an exact picture through any lens.
 
@@ -40,6 +43,8 @@ class Scene:
     backdrop: Backdrop | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.sprites, Sequence):
+            raise TypeError(f"sprites: expected a sequence of Sprites, got {type(self.sprites).__name__}")
         object.__setattr__(self, "sprites", tuple(self.sprites))
         for sprite in self.sprites:
             if not isinstance(sprite, Sprite):
@@ -59,13 +64,17 @@ class Scene:
 
     def plates(self, levels: int = LEVELS) -> Plates:
         """The textures as `torchbokeh.ops.planes.render_planes` takes them, the backdrop last."""
+        every = [s.texture for s in self.sprites] + ([] if self.backdrop is None else [self.backdrop.texture])
+        dtype = compute_dtype(*every)
+        textures = [s.texture.to(dtype) for s in self.sprites]
         textures = [
-            s.texture if s.emission == 1 else torch.cat([s.texture[:3] * s.emission, s.texture[3:]])
-            for s in self.sprites
+            t if s.emission == 1 else torch.cat([t[:3] * s.emission, t[3:]])
+            for s, t in zip(self.sprites, textures, strict=True)
         ]
         mirror, infinite = [False] * len(textures), [False] * len(textures)
         if self.backdrop is not None:
-            textures.append(torch.cat([self.backdrop.texture, torch.ones_like(self.backdrop.texture[:1])]))
+            picture = self.backdrop.texture.to(dtype)
+            textures.append(torch.cat([picture, torch.ones_like(picture[:1])]))
             mirror.append(True)
             infinite.append(self.backdrop.distance == torch.inf)
         return Plates.build(textures, mirror, infinite, levels)
@@ -105,9 +114,14 @@ class Scene:
             ``layer_depth (L, 1, H, W)`` and ``layer_motion (L, 2, H, W)``. All float32.
 
         Raises:
+            TypeError: ``camera`` is no `Camera`, or a number is no int.
             ValueError: ``samples`` or ``layers`` is not positive.
         """
+        if not isinstance(camera, Camera):
+            raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
         for name, value in (("samples", samples), ("layers", 1 if layers is None else layers)):
+            if not isinstance(value, Integral) or isinstance(value, bool):
+                raise TypeError(f"{name}: expected an int, got {value!r}")
             if value < 1:
                 raise ValueError(f"{name}: expected at least 1, got {value}")
         return stack_layers(self._fragments(camera, samples), layers, camera.size)

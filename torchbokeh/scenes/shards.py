@@ -49,7 +49,8 @@ def write_shards(
     ``shard-000000.tar`` holds the samples 0 to ``per_shard - 1``, and so on; the last file may be shorter. A file
     appears only when it is whole. A later call with the same arguments writes only what is missing, whether the
     earlier one ended by an error, Ctrl-C or a power cut. The bytes of a file depend on the data set and its indices
-    alone, not on workers, machines or time (the layers are deflated, so machines need the same zlib for that).
+    alone, not on workers or time, nor on machines where these have the same versions of everything (zlib, which
+    deflates the layers, among it).
 
     Machine k of m takes every m-th file. They need not know of each other, may share the folder or have one each to
     be merged by copying, and m may change from run to run. Should two runs write the same file, that only costs time.
@@ -159,7 +160,7 @@ def shard_indices(count: int, per_shard: int = 100, shard: tuple[int, int] = (1,
 def read_shards(
     source: str | Path | Sequence[str | Path],
     *,
-    keys: Sequence[str] | None = None,
+    keys: Sequence[str] | str | None = None,
     shuffle: int = 0,
     seed: int = 0,
     partial: bool = False,
@@ -182,8 +183,7 @@ def read_shards(
 
     Returns:
         A ``webdataset.DataPipeline``, an ``IterableDataset`` of dicts as those of
-        :class:`~torchbokeh.scenes.ProceduralDataset`. A ``DataLoader`` can only make batches of layers where all
-        samples have the same number of them; leave them out of ``keys`` otherwise, or take ``batch_size=None``.
+        :class:`~torchbokeh.scenes.ProceduralDataset`, which a ``DataLoader`` can put into batches.
 
     Raises:
         ImportError: the package webdataset is missing; it comes with the extra ``torchbokeh[data]``.
@@ -201,6 +201,7 @@ def read_shards(
         raise ImportError("reading shards needs the package webdataset; pip install torchbokeh[data]") from None
     if shuffle < 0:
         raise ValueError(f"shuffle: expected at least 0, got {shuffle}")
+    keys = (keys,) if isinstance(keys, str) else keys
     unknown = {*(keys or ())} - {*_KEYS}
     if unknown:
         raise ValueError(f"keys: expected some of {', '.join(_KEYS)}, got {min(unknown)!r}")
@@ -281,7 +282,10 @@ def _claim(out: Path, dataset: Dataset[dict[str, Any]], count: int, per_shard: i
     found, wanted = _read_manifest(path), json.loads(text)
     before, now = ({**manifest, **manifest["settings"]} for manifest in (found, wanted))
     differing = [name for name in {**before, **now} if name != "settings" and before.get(name) != now.get(name)]
-    if differing:
+    if differing and not has_shards and not any(out.glob(".shard-*.tmp")):
+        with replacing(path) as temporary:  # a run that failed before its first file holds nobody back
+            temporary.write_text(text, encoding="utf-8")
+    elif differing:
         what = ", ".join(
             f"{name} {json.dumps(before.get(name))}, not {json.dumps(now.get(name))}" for name in differing
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 
 import torch
@@ -13,7 +13,7 @@ from torchbokeh.ops._checks import check_image
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sprite:
     """A flat card with a picture on it, seen from both sides.
 
@@ -38,7 +38,7 @@ class Sprite:
         >>> card = Sprite(torch.ones(4, 8, 8), position=(0.0, 0.0, 2.0), size=(0.5, 0.5))
     """
 
-    texture: Tensor
+    texture: Tensor = field(repr=False)
     position: Vector
     size: tuple[float, float]
     rotation: Vector = (0.0, 0.0, 0.0)
@@ -54,11 +54,11 @@ class Sprite:
                 raise ValueError(f"{name}: expected three finite numbers, got {value}")
         if len(_numbers("size", self.size)) != 2 or not all(0 < v < math.inf for v in self.size):
             raise ValueError(f"size: expected a width and a height above 0 in metres, got {self.size}")
-        if not 0 <= self.emission < math.inf:
+        if not 0 <= _number("emission", self.emission) < math.inf:
             raise ValueError(f"emission: expected a factor, 0 or more, got {self.emission}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Backdrop:
     """A picture behind everything, without end: its texture goes on mirrored at its edges.
 
@@ -75,16 +75,22 @@ class Backdrop:
         >>> wall = Backdrop(torch.full((3, 4, 4), 0.5), distance=8.0, width=1.2)
     """
 
-    texture: Tensor
+    texture: Tensor = field(repr=False)
     distance: float = math.inf
     width: float = 1.0
 
     def __post_init__(self) -> None:
         _check_texture(self.texture, 3)
-        if not self.distance > 0:
+        if not _number("distance", self.distance) > 0:
             raise ValueError(f"distance: expected metres above 0, or inf, got {self.distance}")
-        if not 0 < self.width < math.inf:
+        if not 0 < _number("width", self.width) < math.inf:
             raise ValueError(f"width: expected a width above 0 for each metre of distance, got {self.width}")
+
+
+def _number(name: str, value: object) -> float:
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected a number, got {value!r}")
+    return float(value)
 
 
 def _numbers(name: str, value: object) -> Sequence[float]:

@@ -1,5 +1,6 @@
 """Many views of a scene: the accumulation buffer's way to see it."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,18 +12,18 @@ from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3, texel_area
 from torchbokeh.views import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
 
-CHUNK = 16
-"""Frames held at a time while they wait for their sub-samples."""
+CHUNK = 1 << 21
+"""Pixels of frames held at a time while they wait for their sub-samples; only within these are renderings shared."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bounds:
     """Of every card in a view, how blurred and how fast it may be.
 
     Attributes:
         low: ``(K,)`` smallest signed CoC in px.
         high: ``(K,)`` largest one.
-        motion: ``(K,)`` longest way while the shutter is open, in px.
+        motion: ``(K,)`` greatest speed, in px for the time that the shutter is open; ``inf`` where it has no bound.
         texel: ``(K,)`` area of a texel on the screen, in px²; 0 where it is not known.
     """
 
@@ -34,9 +35,11 @@ class Bounds:
 
 @torch.no_grad()
 def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
-    """Bounds from the corners of the cards when the shutter opens, half way and when it closes."""
-    times = torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64)
-    matrix = scene.homographies(camera, torch.zeros(3, 2), times, torch.zeros(3, 2))
+    """Bounds from the corners of the cards, at times between which none of them turns by more than 45 degrees."""
+    fastest = max((math.hypot(*s.angular_velocity) for s in scene.sprites), default=0.0)
+    middle = 1 + min(math.ceil(fastest * camera.shutter / (math.pi / 4)), 64)
+    times = torch.linspace(-0.5, 0.5, 2 * middle + 1, dtype=torch.float64)
+    matrix = scene.homographies(camera, torch.zeros(len(times), 2), times, torch.zeros(len(times), 2))
     w, h = (torch.tensor([p[0].shape[n] for p in plates.levels], dtype=torch.float64) for n in (2, 1))
     zero, one = torch.zeros_like(w), torch.ones_like(w)
     corners = torch.stack(
@@ -49,10 +52,10 @@ def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
     inside = depth > 0
     coc = _coc(camera, torch.where(inside, depth, 1e-6))
     flat = coc.reshape(-1, len(plates.levels))
-    motion = (place - place[1]).norm(dim=-1).amax((0, 1)) * 2
+    motion = place.diff(dim=0).norm(dim=-1).amax((0, 1)) * (2 * middle)  # at the greatest speed of all
     motion = torch.where(inside.all(1).all(0), motion, torch.inf)
     still = torch.tensor(plates.mirror)  # the backdrop's corners may be anywhere, and it does not move
-    texel = torch.stack([texel_area(matrix[1, k], p[0]) for k, p in enumerate(plates.levels)])
+    texel = torch.stack([texel_area(matrix[middle, k], p[0]) for k, p in enumerate(plates.levels)])
     return Bounds(flat.amin(0), flat.amax(0), torch.where(still, 0.0, motion), texel)
 
 
@@ -62,7 +65,7 @@ def accumulate_scene(
     """The mean of the views ``(1, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
     if len(scene) == 0:
         return torch.zeros(1, 4, *camera.size)
-    plates = scene.plates()
+    plates = scene.plates() if level_of_detail else scene.plates(levels=1)
     seen = bounds(scene, plates, camera)
     count = len(views)
     level = torch.zeros(count, len(plates.levels), dtype=torch.long)
@@ -70,8 +73,7 @@ def accumulate_scene(
         most = torch.tensor([len(p) - 1 for p in plates.levels])
         level = detail_levels(smallest_radius(seen.low, seen.high), seen.texel, level_of_detail, count, most)
     offsets, scale = subsample_offsets(views.lens, subsamples)
-    if subsamples:
-        views = Views(views.lens * scale, views.time, views.shift)
+    views = Views(views.lens * scale, views.time, views.shift)
     parents = None
     if reuse:
         parents = shared_views(views, largest_coc(seen.low, seen.high), seen.motion, reuse, level)
@@ -82,8 +84,9 @@ def accumulate_scene(
     texels = plates.levels[0][0]
     total = torch.zeros(1, 4, *camera.size, device=texels.device)
     limit = _coc(camera, torch.full((1, 1), torch.inf))
-    for start in range(0, count, CHUNK):
-        part = slice(start, start + CHUNK)
+    chunk = max(1, CHUNK // (camera.size[0] * camera.size[1]))
+    for start in range(0, count, chunk):
+        part = slice(start, start + chunk)
         own, lod, shared = inverse[part], level[part], None
         if parents is not None:
             chosen = parents[part]

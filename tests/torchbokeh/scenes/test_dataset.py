@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
+import torchbokeh.scenes.dataset as dataset
 from torchbokeh import AccumulationBuffer, ThinLens
 from torchbokeh.scenes import RECIPES, Camera, ProceduralDataset, Scene
 
@@ -140,9 +141,22 @@ def spied(monkeypatch: pytest.MonkeyPatch, name: str) -> list[tuple[Scene, Camer
 def test_target_and_picture_are_those_of_the_scene(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     made = spied(monkeypatch, name)
     settings = {"views": 12, "level_of_detail": 0.5, "reuse": 1}
-    sample = small(recipes=(name,), layers=3, **settings)[2]
+    buffers = []
+
+    def spy(**given: Any) -> AccumulationBuffer:
+        buffers.append(given)
+        return AccumulationBuffer(**given)
+
+    data = small(recipes=(name,), layers=3, **settings)
+    monkeypatch.setattr(dataset, "AccumulationBuffer", spy)
+    sample = data[2]
     [(scene, camera, args)] = made
-    assert torch.equal(sample["target"], AccumulationBuffer(**settings)(scene, camera)[0, :3])
+    assert buffers[0].items() >= settings.items()
+    assert torch.equal(sample["target"], AccumulationBuffer(**buffers[0])(scene, camera)[0, :3])
+    data[3], data[2]
+    seeds = [given["seed"] for given in buffers]
+    assert seeds[0] == seeds[2] != seeds[1], "each sample has noise of its own, always the same"
+    del made[1:]
     seen = scene.render(camera, samples=4, layers=3)
     for key in ("image", "depth", "motion", "layers", "layer_depth", "layer_motion"):
         assert torch.equal(sample[key], seen[key])
@@ -151,7 +165,7 @@ def test_target_and_picture_are_those_of_the_scene(name: str, monkeypatch: pytes
     # It converges to the exact picture, of which the pinhole picture is no part.
     exact = AccumulationBuffer(views=2048)(scene, camera)[0, :3]
     fine = small(recipes=(name,), views=512)[2]["target"]
-    assert float((fine - exact).abs().mean()) < 0.01 * float(exact.mean())
+    assert float((fine - exact).abs().mean()) < 0.02 * float(exact.mean())  # their noise is independent
 
 
 def test_blur_lies_within_its_range(monkeypatch: pytest.MonkeyPatch) -> None:

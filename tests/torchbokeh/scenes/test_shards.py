@@ -403,3 +403,10 @@ def test_procedural_dataset(tmp_path):
         assert_same(sample, {key: dataset[index][key] for key in sample})
     write(tmp_path / "again", dataset, count=3, per_shard=2, workers=2)
     assert content(tmp_path / "again") == content(tmp_path / "once")
+
+
+def test_a_run_that_failed_before_its_first_file_holds_nobody_back(tmp_path):
+    with pytest.raises(ValueError, match="sample 0: expected the keys"):
+        write_shards([{"image": torch.zeros(3, 2, 2)}] * 4, tmp_path, 4)
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset.json"]
+    assert len(write_shards(Fake(4), tmp_path, 4, per_shard=2)) == 2
