@@ -210,17 +210,21 @@ def render_planes(
     most = max((len(pyramid) for pyramid in plates.levels), default=1)
     first = np.zeros((count, most), np.int64)
     sizes = np.zeros((count, most, 2), np.int64)
-    flat = []
-    place = 0
+    flat: list[Tensor] = []
+    places: dict[tuple[int, bool], int] = {}  # a texture that many rectangles share is there once
+    total = 0
     for k, pyramid in enumerate(plates.levels):
         for lod, texture in enumerate(pyramid):
-            first[k, lod] = place
+            key = id(texture), plates.mirror[k]
+            if key not in places:
+                places[key] = total
+                rim = torch.nn.functional.pad(
+                    texture.detach()[None], (1, 1, 1, 1), mode="replicate" if plates.mirror[k] else "constant"
+                )
+                flat.append(rim[0].permute(1, 2, 0).reshape(-1, 4))
+                total += len(flat[-1])
+            first[k, lod] = places[key]
             sizes[k, lod] = texture.shape[2], texture.shape[1]
-            rim = torch.nn.functional.pad(
-                texture.detach()[None], (1, 1, 1, 1), mode="replicate" if plates.mirror[k] else "constant"
-            )
-            flat.append(rim[0].permute(1, 2, 0).reshape(-1, 4))
-            place += len(flat[-1])
     texels = torch.cat(flat).reshape(-1).numpy()
     full = sizes[:, 0].astype(np.float64)
     homographies = inverse.detach().double().contiguous().numpy()

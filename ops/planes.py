@@ -48,14 +48,18 @@ class Plates:
             if len(flags) != len(textures):
                 raise ValueError(f"{name}: expected one for each of {len(textures)} textures, got {len(flags)}")
         levels = []
+        made: dict[tuple[int, bool], tuple[Tensor, ...]] = {}  # cards that share a texture share its levels
         for texture, endless in zip(textures, mirror, strict=True):
             check_image("textures", texture, (4, "h", "w"))
             if texture.numel() == 0:
                 raise ValueError(f"textures: expected at least one texel, got shape {tuple(texture.shape)}")
-            pyramid = [texture]
-            while len(pyramid) < count and max(pyramid[-1].shape[1:]) > 1:
-                pyramid.append(_halved(pyramid[-1], endless))
-            levels.append(tuple(pyramid))
+            key = id(texture), bool(endless)
+            if key not in made:
+                pyramid = [texture]
+                while len(pyramid) < count and max(pyramid[-1].shape[1:]) > 1:
+                    pyramid.append(_halved(pyramid[-1], endless))
+                made[key] = tuple(pyramid)
+            levels.append(made[key])
         return cls(tuple(levels), tuple(mirror), tuple(infinite))
 
 
