@@ -34,10 +34,6 @@ class Views:
     def __len__(self) -> int:
         return len(self.time)
 
-    def part(self, start: int, stop: int) -> "Views":
-        """Some of the views, in order."""
-        return Views(self.lens[start:stop], self.time[start:stop], self.shift[start:stop])
-
 
 def smallest_radius(low: Tensor, high: Tensor) -> Tensor:
     """The smallest ``|coc|`` within each range: 0 where it spans the focus."""

@@ -56,15 +56,6 @@ def test_a_mean_over_the_views_is_one_over_lens_shutter_and_pixel() -> None:
     assert (views.time @ views.shift / 2000).abs().max() < 2e-3
 
 
-def test_part_keeps_the_order() -> None:
-    views = spread(20)
-    part = views.part(5, 9)
-    assert len(part) == 4
-    assert torch.equal(part.lens, views.lens[5:9])
-    assert torch.equal(part.time, views.time[5:9])
-    assert torch.equal(part.shift, views.shift[5:9])
-
-
 def test_smallest_and_largest_within_a_range() -> None:
     low = numbers(2.0, -5.0, -3.0, 0.0, -4.0, -math.inf)
     high = numbers(7.0, -1.5, 4.0, 3.0, 0.0, -9.0)

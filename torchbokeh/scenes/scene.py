@@ -161,9 +161,7 @@ def _box(homography: Tensor, plate: Plates, size: tuple[int, int]) -> tuple[int,
     """Rows and columns of the picture that may show a card: top, left, bottom, right; all of it where in doubt."""
     texel = 2.0 ** (len(plate.levels[0]) - 1)
     h, w = (n * texel for n in plate.levels[0][-1].shape[1:])  # a level of odd size may end beyond level 0
-    rim = 0.5 * texel
-    x0, x1, y0, y1 = -rim, w + rim, -rim, h + rim
-    corners = torch.tensor([[x0, y0, 1], [x1, y0, 1], [x1, y1, 1], [x0, y1, 1]], dtype=torch.float64)
+    corners = _corners(h, w, 0.5 * texel)
     points = corners @ homography.mT
     if plate.mirror[0] or not bool((points[:, 2] > 1e-6).all()):
         return 0, 0, *size
@@ -176,10 +174,9 @@ def _box(homography: Tensor, plate: Plates, size: tuple[int, int]) -> tuple[int,
     return top, clipped((x.min() - 1).floor(), size[1]), bottom, clipped((x.max() + 1).ceil(), size[1])
 
 
-def _corners(texture: Tensor, rim: float) -> Tensor:
-    """Corners ``(4, 3)`` of a card in texture coordinates ``(s, t, 1)``, and of ``rim`` texels around it."""
-    h, w = texture.shape[1:]
-    x0, x1, y0, y1 = -rim, w + rim, -rim, h + rim
+def _corners(height: float, width: float, rim: float = 0.0) -> Tensor:
+    """Corners ``(4, 3)`` of a card of so many texels, and of ``rim`` more around it, as ``(s, t, 1)`` in order."""
+    x0, x1, y0, y1 = -rim, width + rim, -rim, height + rim
     return torch.tensor([[x0, y0, 1], [x1, y0, 1], [x1, y1, 1], [x0, y1, 1]], dtype=torch.float64)
 
 
@@ -192,7 +189,7 @@ def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Te
     x, y = pixel_centres((h, w), middle)
     s, t, inverse_depth = torch.einsum("ij,jyx->iyx", inverse3(middle), torch.stack([x, y, torch.ones_like(x)]))
     # The centre of a pixel that holds some of a card may look past the card, even past its horizon.
-    corners = _corners(plate.levels[0][0], 0.0) @ middle[2]
+    corners = _corners(*plate.levels[0][0].shape[1:]) @ middle[2]
     near, far = float(corners.min()), float(corners.max())
     inverse_depth = inverse_depth.clamp(1 / far if far > 0 else 1e-9, 1 / near if near > 0 else torch.inf)
     depth = inverse_depth.reciprocal()[None]
@@ -212,7 +209,7 @@ def _minified(homography: Tensor, plate: Plates, samples: int) -> int:
 
 def texel_area(homography: Tensor, texture: Tensor) -> Tensor:
     """Area in px² that a texel covers on the screen, on the average over the card; 0 where that can't be said."""
-    x, y, z = (_corners(texture, 0.0) @ homography.mT).unbind(-1)
+    x, y, z = (_corners(*texture.shape[1:]) @ homography.mT).unbind(-1)
     x, y = x / z, y / z
     area = 0.5 * (x * y.roll(-1, -1) - y * x.roll(-1, -1)).sum(-1).abs()
     return torch.where((z > 0).all(-1), area, 0.0) / texture[0].numel()
