@@ -39,12 +39,13 @@ def _semicircle(t):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _row_table(r, first, n, shapes, s, bulge, inv_area, left, right, weight, arcs):  # type: ignore[no-untyped-def]
-    """Fill ``left``, ``right``, ``weight`` for the rows ``first .. first+n-1`` of a PSF of radius ``r``.
+def row_table(r, first, n, shapes, s, bulge, inv_area, rows):  # type: ignore[no-untyped-def]
+    """Fill ``rows (4, > n)`` for the rows ``first .. first+n-1`` from the centre of a PSF of radius ``r``.
 
-    ``shapes[s]`` is ``(K, 7)``: y, left, right, integral of left, integral of right, slope of left and right.
-    ``arcs`` is scratch, one longer than the others.
+    They take the left ends, the right ends, the weights and scratch. ``first`` need not be whole. ``shapes[s]`` is
+    ``(K, 7)``: y, left, right, integral of left, integral of right, slope of left and right.
     """
+    left, right, weight, arcs = rows[0], rows[1], rows[2], rows[3]
     knots = shapes.shape[1]
     bottom, top = shapes[s, 0, 0], shapes[s, knots - 1, 0]
     inv = 1.0 / r
@@ -107,8 +108,8 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
     height, width = coc.shape
     stride = 4 * (width + 2)
     band = np.zeros((y1 - y0) * stride, np.float64)
-    lefts = np.empty(y1 - y0, np.float64)
-    rights, weights, arcs = np.empty_like(lefts), np.empty_like(lefts), np.empty(y1 - y0 + 1, np.float64)
+    rows = np.empty((4, y1 - y0 + 1), np.float64)
+    lefts, rights, weights = rows[0], rows[1], rows[2]
     right_border = np.float64(width)
     for y in range(height):
         if y + reach[y] + 1.0 < y0 or y - reach[y] - 1.0 > y1:
@@ -123,7 +124,7 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
             first, n = _row_range(r, y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
             if n <= 0:
                 continue
-            _row_table(r, first, n, shapes, s, bulge, inv_area, lefts, rights, weights, arcs)
+            row_table(r, first, n, shapes, s, bulge, inv_area, rows)
             o = (y + first - y0) * stride
             for k in range(n):
                 # What starts left of the image starts at its border; what ends right of it never ends.
@@ -168,15 +169,39 @@ def _edges_at(shapes, s, piece, y, bulge, half, middle):  # type: ignore[no-unty
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def row_slopes(r, first, n, shapes, s, bulge, inv_area, rows, slopes):  # type: ignore[no-untyped-def]
+    """Derivatives ``slopes (3, n)`` by the radius of the ``rows`` that `row_table` has filled: left, right, weight."""
+    knots = shapes.shape[1]
+    bottom, top = shapes[s, 0, 0], shapes[s, knots - 1, 0]
+    half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
+    inv = 1.0 / r
+    piece = 0
+    for k in range(n):
+        low = (first + k - 0.5) * inv
+        high = (first + k + 0.5) * inv
+        d_low = -low * inv if low > bottom else 0.0
+        d_high = -high * inv if high < top else 0.0
+        low, high = max(low, bottom), min(high, top)
+        while piece < knots - 2 and shapes[s, piece + 1, 0] <= low:
+            piece += 1
+        low_left, low_right = _edges_at(shapes, s, piece, low, bulge, half, middle)
+        upper = piece
+        while upper < knots - 2 and shapes[s, upper + 1, 0] <= high:
+            upper += 1
+        high_left, high_right = _edges_at(shapes, s, upper, high, bulge, half, middle)
+        slopes[0, k] = _edge_slope(r, rows[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
+        slopes[1, k] = _edge_slope(r, rows[1, k] * inv, low, high, low_right, high_right, d_low, d_high)
+        slopes[2, k] = ((d_high - d_low) * inv_area - rows[2, k]) * inv
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad_coc):  # type: ignore[no-untyped-def]
     """Adjoint of the splat for the pixels of rows ``y0 .. y1-1``.
 
     ``grad (H, W+2, 4)`` is the gradient of the differences. Adds to ``grad_src (H*W*4)``, ``grad_coc (H, W)``.
     """
     height, width = coc.shape
-    knots = shapes.shape[1]
-    lefts = np.empty(height, np.float64)
-    rights, weights, arcs = np.empty_like(lefts), np.empty_like(lefts), np.empty(height + 1, np.float64)
+    rows, slopes = np.empty((4, height + 1), np.float64), np.empty((3, height), np.float64)
     right_border = np.float64(width)
     pixel = np.empty(4, np.float64)
     total = np.empty(4, np.float64)
@@ -186,20 +211,17 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
             c = np.float64(coc[y, x])
             s = 1 if c < 0.0 else 0
             r = max(abs(c), MIN_RADIUS)
-            bottom, top = shapes[s, 0, 0], shapes[s, -1, 0]
-            half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
-            first, n = _row_range(r, y, bottom, top, 0, height)
-            _row_table(r, first, n, shapes, s, bulge, inv_area, lefts, rights, weights, arcs)
+            first, n = _row_range(r, y, shapes[s, 0, 0], shapes[s, -1, 0], 0, height)
+            row_table(r, first, n, shapes, s, bulge, inv_area, rows)
+            row_slopes(r, first, n, shapes, s, bulge, inv_area, rows, slopes)
             for k in range(4):
                 pixel[k] = src[p + k]
                 total[k] = 0.0
             slope = 0.0
-            piece = 0
-            inv = 1.0 / r
             for k in range(n):
-                w = weights[k]
-                left = x + 0.5 + lefts[k]
-                right = x + 0.5 + rights[k]
+                w = rows[2, k]
+                left = x + 0.5 + rows[0, k]
+                right = x + 0.5 + rows[1, k]
                 left_moves = 0.0 < left < right_border
                 right_moves = 0.0 < right < right_border
                 left = min(max(left, 0.0), right_border)
@@ -216,32 +238,18 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
                     by_weight += mass * pixel[ch]
                     by_left += (b - a) * pixel[ch]
                     by_right -= (e - d) * pixel[ch]
-                low = (first + k - 0.5) * inv
-                high = (first + k + 0.5) * inv
-                d_low = -low * inv if low > bottom else 0.0
-                d_high = -high * inv if high < top else 0.0
-                low, high = max(low, bottom), min(high, top)
-                while piece < knots - 2 and shapes[s, piece + 1, 0] <= low:
-                    piece += 1
-                low_left, low_right = _edges_at(shapes, s, piece, low, bulge, half, middle)
-                upper = piece
-                while upper < knots - 2 and shapes[s, upper + 1, 0] <= high:
-                    upper += 1
-                high_left, high_right = _edges_at(shapes, s, upper, high, bulge, half, middle)
                 if left_moves:
-                    slope += by_left * w * _edge_slope(r, lefts[k] * inv, low, high, low_left, high_left, d_low, d_high)
+                    slope += by_left * w * slopes[0, k]
                 if right_moves:
-                    slope += (
-                        by_right * w * _edge_slope(r, rights[k] * inv, low, high, low_right, high_right, d_low, d_high)
-                    )
-                slope += by_weight * ((d_high - d_low) * inv_area - w) * inv
+                    slope += by_right * w * slopes[1, k]
+                slope += by_weight * slopes[2, k]
             for k in range(4):
                 grad_src[p + k] = total[k]
             if abs(c) > MIN_RADIUS:
                 grad_coc[y, x] += slope if c > 0.0 else -slope
 
 
-def _shapes(profile: Profile) -> tuple[np.ndarray, float, float]:
+def shape_tables(profile: Profile) -> tuple[np.ndarray, float, float]:
     """The tables of the upright and of the point-mirrored shape ``(2, K, 7)``, the bulge and 1/area."""
     knots = profile.knots.detach().double()
     upright = (knots, torch.stack([-knots[:, 0], -knots[:, 2], -knots[:, 1]], 1).flip(0))
@@ -262,7 +270,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) 
     """`torchbokeh.ops.splat.splat_spans` for CPU float32."""
     b, c, h, w = values.shape
     groups = -(-c // 4)
-    shapes, bulge, inv_area = _shapes(profile)
+    shapes, bulge, inv_area = shape_tables(profile)
     src = interleave(values.detach()).numpy()
     coc_np = coc.detach().contiguous().numpy()
     extent = max(abs(shapes[0, 0, 0]), abs(shapes[0, -1, 0]))
@@ -283,7 +291,7 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
     """Adjoint: gradient ``(B, C, H, W)`` of the differences to the gradients of ``values`` and ``coc``."""
     b, c, h, w = values.shape
     groups = -(-c // 4)
-    shapes, bulge, inv_area = _shapes(profile)
+    shapes, bulge, inv_area = shape_tables(profile)
     src = interleave(values.detach()).numpy()
     differences = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 0, 2)).numpy()
     coc_np = coc.detach().contiguous().numpy()
