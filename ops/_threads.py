@@ -1,23 +1,56 @@
-"""Run independent pieces of work on as many threads as torch uses."""
+"""Run independent pieces of work on as many threads as torch uses, and on request take the time of each stage."""
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 
+_recorded: dict[str, float] | None = None
 
-def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]]) -> None:
+
+@contextmanager
+def recorded() -> Iterator[dict[str, float]]:
+    """Seconds that each named stage of the kernels takes within the block. For one thread that calls kernels."""
+    global _recorded
+    before, _recorded = _recorded, {}
+    try:
+        yield _recorded
+    finally:
+        _recorded = before
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Count the time of the block as that of the stage ``name``, if anyone records."""
+    seconds = _recorded
+    if seconds is None:
+        yield
+        return
+    start = time.perf_counter()
+    yield
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]], name: str = "other") -> None:
     """Call ``work(*piece)`` for every piece, on ``torch.get_num_threads()`` threads.
 
     The pool lives for one call only, so nothing is left behind that a forked process could trip over; a
     ``DataLoader`` worker has one thread and runs the pieces itself. The pieces must not depend on each other.
+
+    Args:
+        work: the function.
+        pieces: its arguments, one tuple for each call.
+        name: the stage that the time counts for, see `recorded`.
     """
     threads = torch.get_num_threads()
-    if threads == 1:
-        for piece in pieces:
-            work(*piece)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(work, *piece) for piece in pieces]:
-            done.result()
+    with stage(name):
+        if threads == 1:
+            for piece in pieces:
+                work(*piece)
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            for done in [pool.submit(work, *piece) for piece in pieces]:
+                done.result()

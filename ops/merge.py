@@ -1,0 +1,302 @@
+"""Merging by radius: cost that falls with the blur.
+
+A wide PSF needs neither every source pixel nor every target pixel by itself. Pixels whose radius is at least
+``2**l * cells`` are summed over blocks of ``2**l x 2**l`` pixels, the *cells* of level ``l``; the cells are splatted
+into a picture of the size of the level, with their mean radius, and that picture is interpolated up to the next finer
+level and added. So a pixel of radius r costs about ``4 r / 4**l`` points with ``2**l`` in proportion to r: the wider,
+the cheaper, and without an upper bound of the radius.
+
+Where the error comes from, and what is done about it:
+
+* *Interpolation.* Bilinear interpolation blurs once more. A level holds means over its cells, so they are cut into
+  the means of four smaller cells by a parabola through three of them (`upsample`): exact for quadratic pictures.
+* *Level borders.* Between the radii of two levels a pixel shares itself between both: no seam, no popping.
+* *Highlights.* What is so bright that the edge of its PSF can be seen stays on the lowest level, whatever its radius.
+* *Mixed radii.* A cell only holds pixels of one level, so their radii differ by little more than a factor of two, and
+  of one surface, since surfaces are splatted one by one. Finer classes of radius change little, and sub-pixel centres
+  of partly filled cells change less: neither is worth its time.
+
+Everything is linear in the values. Merging knows nothing of the PSF: it calls a function that splats a picture with
+given radii, once for each level, in whatever domain that function works.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.spans import Profile, working_dtype
+from torchbokeh.ops.splat import splat_spans
+
+FADE = 0.125
+"""Radii from one to ``1 + FADE`` times the least radius of a level belong partly to the level below."""
+
+STEPS = 64
+"""Radii are rounded to this fraction of a cell, so that few PSFs have to be drawn for many cells."""
+
+MARGIN = 2
+"""Cells around the picture of a level: interpolation at the border looks beyond it."""
+
+FEWEST = 16
+"""Cells across the longer side of the coarsest level. From there on, the height of the picture bounds the cost."""
+
+LEAST_CONTRAST = 4.0
+"""A highlight is at least this many times as bright as the mean."""
+
+
+class Merging(NamedTuple):
+    """How far to merge.
+
+    Attributes:
+        cells: a PSF spans at least this radius in cells of its level; more is more exact, and slower.
+        highlight: a pixel is a highlight where it is brighter, by its channel's mean, than ``highlight`` times its
+            squared radius (and `LEAST_CONTRAST`): spread over its disc, it then stands out by ``highlight / pi``.
+    """
+
+    cells: float
+    highlight: float
+
+
+def highest_level(largest: float, size: tuple[int, int], merging: Merging) -> int:
+    """The coarsest level that radii up to ``largest`` px need in a picture of ``(H, W)``; 0 merges nothing."""
+    room = max(math.floor(math.log2(max(*size, FEWEST) / FEWEST)), 0)
+    if largest < 2 * merging.cells:
+        return 0
+    return min(math.floor(math.log2(largest / merging.cells)), room)
+
+
+def level_shares(values: Tensor, coc: Tensor, merging: Merging, highest: int) -> list[Tensor]:
+    """Share ``(B, 1, H, W)`` of every pixel in the levels ``0 .. highest``; the shares of a pixel sum to 1.
+
+    They are a choice, not a part of the picture: no gradient runs through them.
+    """
+    values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
+    mean = values.abs().mean((2, 3), keepdim=True)
+    bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
+    ordinary = (values.abs() <= mean * bound).all(1, keepdim=True)
+    above = [torch.ones_like(radius)]
+    for level in range(1, highest + 1):
+        excess = radius / (merging.cells * 2**level) - 1
+        above.append((excess / FADE).clamp(0, 1) * ordinary)
+    above.append(torch.zeros_like(radius))
+    return [(above[k] - above[k + 1]).to(values.dtype) for k in range(highest + 1)]
+
+
+def merge_cells(values: Tensor, coc: Tensor, shares: list[Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """The pictures that are splatted: values and signed CoC in cells, for every level.
+
+    Args:
+        values: ``(B, C, H, W)``.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        shares: those of `level_shares`.
+
+    Returns:
+        For level ``l`` the sums ``(B, C, h, w)`` over blocks of ``2**l x 2**l`` pixels, h and w rounded up, and the
+        mean radius ``(B, 1, h, w)`` in cells, with the sign that prevails.
+    """
+    levels = []
+    for level, share in enumerate(shares):
+        size = 2**level
+        border = (0, -values.shape[3] % size, 0, -values.shape[2] % size)
+
+        def total(t: Tensor, size: int = size, border: tuple[int, ...] = border) -> Tensor:
+            return F.avg_pool2d(F.pad(t, border), size) * size**2 if size > 1 else t
+
+        radius = total(share * coc.abs()) / total(share).clamp_min(TINY) / size
+        rounded = (radius.detach() * STEPS).round() / STEPS
+        radius = radius + (rounded - radius.detach())
+        levels.append((total(values * share), torch.where(total(share * coc.detach()) < 0, -radius, radius)))
+    return levels
+
+
+def upsample(coarse: Tensor) -> Tensor:
+    """Twice as many cells each way, ``(B, C, h, w) -> (B, C, 2h, 2w)``: means over cells to means over their quarters.
+
+    A parabola that has the means of three neighbouring cells has the means ``b ± (a - c) / 8`` over the halves of the
+    middle one: the total is kept, and quadratic pictures are met exactly.
+    """
+    for dim in (2, 3):
+        n = coarse.shape[dim]
+        before = torch.cat([coarse.narrow(dim, 0, 1), coarse.narrow(dim, 0, n - 1)], dim)
+        after = torch.cat([coarse.narrow(dim, 1, n - 1), coarse.narrow(dim, n - 1, 1)], dim)
+        tilt = (before - after) / 8
+        coarse = torch.stack([coarse + tilt, coarse - tilt], dim + 1).flatten(dim, dim + 1)
+    return coarse
+
+
+def merged(
+    values: Tensor, coc: Tensor, splat: Callable[[Tensor, Tensor], Tensor], merging: Merging, highest: int
+) -> Tensor:
+    """Splat with merging, for any PSF.
+
+    Args:
+        values: ``(B, C, H, W)``, what each pixel spreads.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        splat: takes values ``(B, C, h, w)`` and radii ``(B, 1, h, w)`` in cells and returns the blurred picture
+            ``(B, C, h, w)``.
+        merging: how far to merge.
+        highest: the coarsest level, see `highest_level`.
+
+    Returns:
+        ``(B, C, H, W)``, close to ``splat(values, coc)``.
+    """
+    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest))
+
+    def picture(level: int) -> Tensor:
+        margin = MARGIN if level else 0
+        out = splat(*(F.pad(t, (margin,) * 4) for t in levels[level]))
+        if level == highest:
+            return out
+        start, (h, w) = 2 * MARGIN - margin, out.shape[2:]
+        return out + upsample(picture(level + 1))[..., start : start + h, start : start + w] / 4
+
+    return picture(0)
+
+
+def splat_merged(
+    values: Tensor,
+    coc: Tensor,
+    profile: Profile,
+    merging: Merging,
+    *,
+    highest: int | None = None,
+    ones: bool = False,
+    normalise: bool = False,
+) -> Tensor:
+    """Blur with flat convex PSFs, merged by radius: close to `splat_spans(..., integrate=True)` and much faster.
+
+    Args:
+        values: ``(B, C, H, W)``, what each pixel spreads.
+        coc: ``(B, 1, H, W)`` signed radius in px. Must be finite.
+        profile: the unit shape of the PSF, see `torchbokeh.psfs.aperture`.
+        merging: how far to merge.
+        highest: the coarsest level; ``None`` looks at ``coc`` once.
+        ones: splat a channel of ones as well, the coverage, and put it last.
+        normalise: divide the values by the last channel, the coverage.
+
+    Returns:
+        ``(B, C, H, W)``, or ``(B, C + 1, H, W)`` with ``ones``, in the dtype of ``values`` (of ``values`` and ``coc``
+        where both are at least float32). Differentiable to ``values``, ``coc`` and ``profile``.
+
+    Raises:
+        TypeError: an argument is not a floating-point tensor.
+        ValueError: shapes or devices do not fit.
+
+    Example:
+        >>> import torch
+        >>> from torchbokeh.psfs import Disc
+        >>> image, coc = torch.full((1, 3, 64, 64), 0.5), torch.full((1, 1, 64, 64), 20.0)
+        >>> out = splat_merged(image, coc, Disc().profile(), Merging(4, 0.03), ones=True, normalise=True)
+        >>> out.shape, round(out[:, :3].min().item(), 5), round(out[:, :3].max().item(), 5)
+        (torch.Size([1, 4, 64, 64]), 0.5, 0.5)
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    b, _, h, w = values.shape
+    check_image("coc", coc, (b, 1, h, w), like=values)
+    check_image("profile.knots", profile.knots, ("K", 3), like=values)
+    check_image("profile.bulge", profile.bulge, (), like=values)
+    if highest is None:
+        highest = highest_level(float(coc.detach().abs().max()) if coc.numel() else 0.0, (h, w), merging)
+    dtype = compute_dtype(values, coc)
+    source, radius = values.to(dtype), coc.to(dtype)
+    fixed = not (profile.knots.requires_grad or profile.bulge.requires_grad)
+    if has_kernel(source) and fixed and source.numel():
+        knots, bulge = profile.knots.double(), profile.bulge.double()
+        out = _splat_merged_op(source, radius, knots, bulge, *merging, highest, ones, normalise)
+    else:
+        if ones:
+            source = torch.cat([source, torch.ones_like(radius)], 1)
+        out = merged(source, radius, lambda v, r: splat_spans(v, r, profile, integrate=True), merging, highest)
+        if normalise:
+            out = torch.cat([out[:, :-1] / out[:, -1:].clamp_min(TINY), out[:, -1:]], 1)
+    return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
+
+
+@torch.library.custom_op("torchbokeh::splat_merged", mutates_args=())
+def _splat_merged_op(
+    values: Tensor,
+    coc: Tensor,
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+    ones: bool,
+    normalise: bool,
+) -> Tensor:
+    from torchbokeh.ops import _merge_kernels
+
+    merging = Merging(cells, highlight)
+    return _merge_kernels.splat_merged(values, coc, Profile(knots, bulge), merging, highest, ones, normalise)
+
+
+@_splat_merged_op.register_fake
+def _(
+    values: Tensor,
+    coc: Tensor,
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+    ones: bool,
+    normalise: bool,
+) -> Tensor:
+    b, c, h, w = values.shape
+    return values.new_empty(b, c + ones, h, w)
+
+
+@torch.library.custom_op("torchbokeh::gather_merged", mutates_args=())
+def _gather_merged_op(
+    grad: Tensor,
+    out: Tensor | None,
+    values: Tensor,
+    coc: Tensor,
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+    ones: bool,
+) -> tuple[Tensor, Tensor]:
+    from torchbokeh.ops import _merge_gather
+
+    merging = Merging(cells, highlight)
+    return _merge_gather.gather_merged(grad, out, values, coc, Profile(knots, bulge), merging, highest, ones)
+
+
+@_gather_merged_op.register_fake
+def _(
+    grad: Tensor,
+    out: Tensor | None,
+    values: Tensor,
+    coc: Tensor,
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+    ones: bool,
+) -> tuple[Tensor, Tensor]:
+    like = torch.contiguous_format
+    return torch.empty_like(values, memory_format=like), torch.empty_like(coc, memory_format=like)
+
+
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *tensors, cells, highlight, highest, ones, normalise = inputs
+    ctx.settings = cells, highlight, highest, ones
+    ctx.save_for_backward(*tensors, output if normalise else None)
+
+
+def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    *tensors, out = ctx.saved_tensors
+    return (*_gather_merged_op(grad, out, *tensors, *ctx.settings), *[None] * 7)
+
+
+_splat_merged_op.register_autograd(_backward, setup_context=_setup)
