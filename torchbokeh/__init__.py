@@ -14,6 +14,7 @@ if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None
 from torchbokeh import scenes
 from torchbokeh.accumulation import AccumulationBuffer
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
+from torchbokeh.kernel_splatting import KernelSplatting, SplattingPlan
 from torchbokeh.lens import DisparityLens, Lens, ThinLens
 from torchbokeh.lens_blur import LensBlur
 from torchbokeh.plan import Plan
@@ -28,12 +29,14 @@ __all__ = [
     "DisparityLens",
     "Ellipse",
     "FFTIntegrator",
+    "KernelSplatting",
     "Lens",
     "LensBlur",
     "Plan",
     "Polygon",
     "PyramidIntegrator",
     "ScanlineIntegrator",
+    "SplattingPlan",
     "ThinLens",
     "scenes",
 ]

@@ -1,0 +1,148 @@
+"""One layer: every pixel spreads its point-spread function, and the sum is divided by the coverage."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchbokeh._signed import signed_coc
+from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.merge import highest_level, splat_merged
+from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.ops.splat import splat_spans
+from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
+
+
+@dataclass(frozen=True)
+class SplattingPlan:
+    """What one layer needs.
+
+    Attributes:
+        size: ``(H, W)`` of the image.
+        largest: the largest radius in px.
+        quality: the operating point.
+        highest: the coarsest level that pixels are merged on; 0 if none are.
+        predicted_error: relative L1 error against the exact splat, see `Quality`.
+        sharp: every radius is below half a pixel: the image passes through.
+    """
+
+    size: tuple[int, int]
+    largest: float
+    quality: Quality
+    highest: int
+    predicted_error: float
+    sharp: bool
+
+    def __str__(self) -> str:
+        height, width = self.size
+        head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
+        if self.sharp:
+            return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.highest == 0:
+            return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
+        return (
+            f"{head}\nQuality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
+            f"merged; predicted relative error {self.predicted_error:.2g}."
+        )
+
+
+class KernelSplatting(nn.Module):
+    """Splatting of point-spread functions for one layer, without occlusion (LKS section 6).
+
+    Every pixel spreads over its circle of confusion; the sum is divided by what was spread to each pixel, so that a
+    constant image stays constant. What lies in front of what does not count: for that see `LensBlur`. Wide PSFs are
+    merged by radius (`torchbokeh.ops.merge`), so that a wider blur costs less.
+
+    Memory on the CPU in float32, besides input and output, for three channels: 16 bytes per pixel forward and 100
+    backward, whatever the radius (exact quality: 20 and 80).
+
+    Args:
+        aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
+        quality: ``"exact"``, ``"high"``, ``"balanced"`` or ``"fast"``; see `torchbokeh.quality.QUALITIES`.
+        tolerance: relative L1 error to keep to, as far as it can be predicted; picks the quality instead.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a value out of its range.
+
+    Example:
+        >>> import torch
+        >>> splatting = KernelSplatting(quality="balanced")
+        >>> image, coc = torch.rand(1, 3, 64, 64), torch.full((1, 1, 64, 64), 20.0)
+        >>> splatting(image, coc).shape
+        torch.Size([1, 3, 64, 64])
+        >>> print(splatting.plan(image, coc))
+        64 x 64 image, radius up to 20.0 px.
+        Quality 'balanced': blocks of up to 4 x 4 pixels are merged; predicted relative error 0.016.
+    """
+
+    def __init__(
+        self, aperture: str | Aperture = "disc", quality: str = "balanced", *, tolerance: float | None = None
+    ) -> None:
+        super().__init__()
+        check_quality(quality, tolerance)
+        self.aperture = parse_aperture(aperture)
+        self.quality = quality
+        self.tolerance = tolerance
+
+    def extra_repr(self) -> str:
+        """The settings, for ``print``."""
+        return f"quality={self.quality!r}" if self.tolerance is None else f"tolerance={self.tolerance}"
+
+    def plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
+        """Look at the radii once, in one small copy from the device. Arguments are those of `forward`."""
+        return self._plan(image, self._checked(image, coc))
+
+    def _plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
+        radius = coc.detach().abs()
+        size = (image.shape[-2], image.shape[-1])
+        if image.numel() == 0:
+            return SplattingPlan(size, 0.0, QUALITIES[0], 0, 0.0, True)
+        largest, *shares = torch.stack([radius.amax(), *merged_shares(radius, self.quality, self.tolerance)]).tolist()
+        quality, error = choose(self.quality, self.tolerance, shares)
+        highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
+        return SplattingPlan(size, largest, quality, highest, error if highest else 0.0, largest <= MIN_RADIUS)
+
+    def forward(self, image: Tensor, coc: Tensor, *, plan: SplattingPlan | None = None) -> Tensor:
+        """Blur a picture.
+
+        Args:
+            image: ``(B, C, H, W)`` linear radiance, any number of channels.
+            coc: ``(B, 1, H, W)`` signed radius in px.
+            plan: a plan made earlier with `plan`; the radii are then not looked at again.
+
+        Returns:
+            ``(B, C, H, W)`` in the dtype of ``image``, differentiable to ``image``, ``coc`` and the aperture.
+
+        Raises:
+            TypeError: an argument is not a floating-point tensor, or not a `SplattingPlan`.
+            ValueError: shapes, devices or values do not fit: see the message.
+        """
+        self._checked(image, coc)
+        if plan is None:
+            plan = self._plan(image, coc)
+        elif not isinstance(plan, SplattingPlan):
+            raise TypeError(f"plan: expected a SplattingPlan, got {type(plan).__name__}")
+        elif plan.size != tuple(image.shape[-2:]):
+            raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
+        if plan.sharp and not coc.requires_grad:
+            return image.clone()
+        with torch.autocast(image.device.type, enabled=False):
+            dtype = compute_dtype(image, coc)
+            source, radius, profile = image.to(dtype), coc.to(dtype), self.aperture.profile()
+            merging = plan.quality.merging
+            if merging is None:
+                out = splat_spans(torch.cat([source, torch.ones_like(radius)], 1), radius, profile, integrate=True)
+                out = out[:, :-1] / out[:, -1:].clamp_min(TINY)
+            else:
+                settings = {"highest": plan.highest, "ones": True, "normalise": True}
+                out = splat_merged(source, radius, profile, merging, **settings)[:, :-1]
+        return out.to(image.dtype)
+
+    @staticmethod
+    def _checked(image: Tensor, coc: Tensor) -> Tensor:
+        check_image("image", image, ("B", "C", "H", "W"))
+        return signed_coc(None, image, None, coc)
