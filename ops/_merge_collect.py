@@ -7,6 +7,7 @@ import numba as nb
 import numpy as np
 
 from torchbokeh.ops._threads import run_all
+from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import FADE, LEAST_CONTRAST, Merging
 
 BAND = 64
@@ -57,19 +58,29 @@ def _largest(row):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def classify(values, coc, y, merging, bounds, highest, level, share):  # type: ignore[no-untyped-def]
-    """Level of every pixel of row ``y`` and its share there; the rest belongs to the level below. -1: a highlight.
+def classify(values, coc, weight, y, merging, bounds, highest, level, share):  # type: ignore[no-untyped-def]
+    """Level of every pixel of row ``y`` and its share there; the rest belongs to the level below.
 
-    ``level`` and ``share`` are float32 rows, so that the compiler can work on many pixels at a time.
+    -1 stands for a highlight, -2 for a pixel without weight. ``level`` and ``share`` are float32 rows, so that the
+    compiler can work on many pixels at a time. Returns the columns between which pixels have weight.
     """
     finest, highlight = np.float32(merging[0]), np.float32(merging[1])
     one, zero, least = np.float32(1.0), np.float32(0.0), np.float32(LEAST_CONTRAST)
     row = coc[y]
     top = _largest(row)
+    begin, end = 0, len(row)
     level[:] = zero
     share[:] = one
-    if highest == 0 or top < np.float32(2.0) * finest:
-        return
+    if weight.shape[0] > 0:
+        weights = weight[y]
+        for x in range(len(row)):
+            level[x] = zero if weights[x] > zero else np.float32(-2.0)
+        while end > 0 and level[end - 1] < zero:
+            end -= 1
+        while begin < end and level[begin] < zero:
+            begin += 1
+    if highest == 0 or begin == end or top < np.float32(2.0) * finest:
+        return begin, end
     for number in range(1, highest + 1):
         threshold = finest * np.float32(1 << number)
         if threshold > top:
@@ -77,13 +88,14 @@ def classify(values, coc, y, merging, bounds, highest, level, share):  # type: i
         here, scale = np.float32(number), np.float32(1.0 / FADE) / threshold
         for x in range(len(row)):
             r = abs(row[x])
-            level[x] = here if r >= threshold else level[x]
+            level[x] = here if (r >= threshold) & (level[x] >= zero) else level[x]
             share[x] = min((r - threshold) * scale, one) if r >= threshold else share[x]
     for k in range(values.shape[0]):
         plane, bound = values[k, y], bounds[k]
         for x in range(len(row)):
             high = (level[x] > zero) & (abs(plane[x]) > bound * max(highlight * row[x] * row[x], least))
             level[x] = -one if high else level[x]
+    return begin, end
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -99,7 +111,7 @@ def _add(cells, p, a, b, c, d, w, r, signed):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reach, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
+def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cells, reach, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
     """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
 
     ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
@@ -114,12 +126,13 @@ def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reac
     c0, c1, c2, c3 = channel[0], channel[1], channel[2], channel[3]
     zero, one = np.float32(0.0), np.float32(1.0)
     a, b, c, d = constant[0], constant[1], constant[2], constant[3]
+    weighted = weight.shape[0] > 0
     levels, shares = np.empty(width, np.float32), np.empty(width, np.float32)
     farthest = np.zeros(highest + 1, np.float32)
     starts = np.empty(highest + 1, np.int64)
     for y in range(y0, y1):
         count = 0
-        classify(values, coc, y, merging, bounds, highest, levels, shares)
+        begin, end = classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
         for level in range(1, highest + 1):
             starts[level] = sizes[level, 2] + (y >> level) * sizes[level, 1]
         farthest[:] = 0.0
@@ -127,14 +140,14 @@ def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reac
         # The sums of the cell that the last pixel went to: neighbours mostly go to the same one.
         current = -1
         s0 = s1 = s2 = s3 = sw = sr = ss = zero
-        for x in range(width):
+        for x in range(begin, end):
             level = int(levels[x])
             signed = coc[y, x]
             r = abs(signed)
             if level <= 0:
                 if level == 0:
                     farthest[0] = max(farthest[0], r)
-                else:
+                elif level == -1:
                     marks[y, count] = y * width + x
                     count += 1
                 continue
@@ -152,7 +165,8 @@ def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reac
                     _add(cells, current, s0, s1, s2, s3, sw, sr, ss)
                 current = p
                 s0 = s1 = s2 = s3 = sw = sr = ss = zero
-            w = shares[x]
+            whole = weight[y, x] if weighted else one
+            w = shares[x] * whole
             s0 += w * a
             s1 += w * b
             s2 += w * c
@@ -161,11 +175,11 @@ def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reac
             sr += w * r
             ss += w * signed
             farthest[level] = max(farthest[level], r)
-            if w < one:
+            if shares[x] < one:
                 level -= 1
                 farthest[level] = max(farthest[level], r)
                 if level > 0:
-                    w = one - w
+                    w = whole - w
                     p = RECORD * (starts[level] + (x >> level))
                     _add(cells, p, w * a, w * b, w * c, w * d, w, w * r, w * signed)
         if current >= 0:
@@ -176,11 +190,46 @@ def _collect(values, coc, channel, constant, merging, bounds, sizes, cells, reac
             reach[level, y >> level] = max(reach[level, y >> level], farthest[level])
 
 
+@nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
+    """For rows ``y0 .. y1-1``: ``sums (H, C+1)`` of weight times magnitude, and of the weight of what is not zero."""
+    channels, _, width = values.shape
+    alive = np.empty(width, np.float32)
+    for y in range(y0, y1):
+        alive[:] = 0.0
+        for k in range(channels):
+            plane = values[k, y]
+            for x in range(width):
+                alive[x] = alive[x] if plane[x] == 0.0 else np.float32(1.0)
+        if weight.shape[0] > 0:
+            row = weight[y]
+            for x in range(width):
+                alive[x] *= row[x]
+        for k in range(channels):
+            plane, total = values[k, y], np.float32(0.0)
+            for x in range(width):
+                total += abs(plane[x]) * alive[x]
+            sums[y, k] = total
+        count = np.float32(0.0)
+        for x in range(width):
+            count += alive[x]
+        sums[y, channels] = count
+
+
+def usual(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Mean magnitude ``(C,)`` of every channel, over the pixels that hold anything: highlights are far above it."""
+    sums = np.empty((values.shape[1], len(values) + 1))
+    run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
+    *totals, count = sums.sum(0)
+    return np.float32(totals) / np.float32(max(count, TINY))
+
+
 def collect(
-    values: np.ndarray, coc: np.ndarray, lanes: Lanes, merging: Merging, bounds: np.ndarray, highest: int
+    values: np.ndarray, coc: np.ndarray, weight: np.ndarray, lanes: Lanes, merging: Merging, highest: int
 ) -> Levels:
-    """Sum ``values (C, H, W)`` with ``coc (H, W)`` into the cells of all levels."""
+    """Sum ``values (C, H, W)`` with ``coc (H, W)`` and ``weight`` (of no rows: all 1) into the cells of all levels."""
     height, width = coc.shape
+    bounds = usual(values, weight)
     sizes = np.zeros((highest + 1, 3), np.int64)
     count = 0
     for level in range(1, highest + 1):
@@ -189,7 +238,7 @@ def collect(
     cells = np.empty(RECORD * count, np.float32)
     reach = np.empty((highest + 1, height), np.float64)
     marks, counts = np.empty((height, width), np.int64), np.empty(height, np.int64)
-    work = partial(_collect, values, coc, *lanes, merging, bounds, sizes, cells, reach, marks, counts)
+    work = partial(_collect, values, coc, weight, *lanes, merging, bounds, sizes, cells, reach, marks, counts)
     tile = max(1 << highest, BAND // 2)  # no cell lies in two tiles
     run_all(work, [(y, min(y + tile, height)) for y in range(0, height, tile)], "collect")
     found = [marks[y, : counts[y]] for y in np.flatnonzero(counts)]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops._merge_collect import RECORD, Lanes, Levels, bands, classify, collect
-from torchbokeh.ops._merge_kernels import bank_of, bounds_of
+from torchbokeh.ops._merge_kernels import bank_of, planes_of
 from torchbokeh.ops._psf_bank import Bank, draw_psf, draw_slopes
 from torchbokeh.ops._rows import gather_rows
 from torchbokeh.ops._span_kernels import shape_tables
@@ -164,8 +164,9 @@ def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads,
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_pixels(  # type: ignore[no-untyped-def]
-    values, coc, channel, constant, merging, bounds, sizes, sums, bank, shape, grads, grad_values, grad_coc, y0, y1
-):
+    values, coc, weight, channel, constant, merging, bounds, sizes, sums, bank, shape, grads,
+    grad_values, grad_coc, grad_weight, y0, y1
+):  # fmt: skip
     """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells."""
     bank_steps, mirrored, pad, firsts, ends, columns, weights, slopes = bank
     in_bank = mirrored if mirrored else len(firsts)
@@ -176,12 +177,15 @@ def _gather_pixels(  # type: ignore[no-untyped-def]
     found = np.empty(8, np.float64)
     grad = np.empty(5, np.float64)
     for y in range(y0, y1):
-        classify(values, coc, y, merging, bounds, highest, levels, shares)
+        classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
         for x in range(width):
             level, share = int(levels[x]), shares[x]
             signed = np.float64(coc[y, x])
+            whole = weight[y, x] if weight.shape[0] > 0 else np.float32(1.0)
             grad[:] = 0.0
-            if level <= 0:
+            if level == -2:
+                lowest = np.float32(0.0)
+            elif level <= 0:
                 lowest = np.float32(1.0)
             else:
                 lowest = np.float32(1.0) - share if level == 1 else np.float32(0.0)
@@ -190,8 +194,9 @@ def _gather_pixels(  # type: ignore[no-untyped-def]
                     w = np.float32(1.0) - share if part else share
                     if here > 0 and w > 0.0:
                         p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
-                        for k in range(5):
+                        for k in range(4):
                             grad[k] += w * grads[p + k]
+                        grad[4] += w * whole * grads[p + 4]
             if lowest > 0.0:
                 radius = np.rint(bank_steps * abs(signed))
                 if radius < in_bank:
@@ -211,10 +216,16 @@ def _gather_pixels(  # type: ignore[no-untyped-def]
                     grad[k] += lowest * found[k]
                     if moves:
                         value = values[channel[k], y, x] if channel[k] >= 0 else constant[k]
-                        grad[4] += found[4 + k] * lowest * value
+                        grad[4] += found[4 + k] * lowest * whole * value
+            by_weight = 0.0
             for k in range(4):
                 if channel[k] >= 0:
-                    grad_values[channel[k], y, x] = grad[k]
+                    grad_values[channel[k], y, x] = whole * grad[k]
+                    by_weight += values[channel[k], y, x] * grad[k]
+                else:
+                    by_weight += constant[k] * grad[k]
+            if weight.shape[0] > 0:
+                grad_weight[y, x] = by_weight if channel[0] == 0 else grad_weight[y, x] + by_weight
             slope = grad[4] if signed > 0.0 else -grad[4]
             grad_coc[y, x] = slope if channel[0] == 0 else grad_coc[y, x] + slope
 
@@ -224,25 +235,30 @@ def gather_merged(
     out: Tensor | None,
     values: Tensor,
     coc: Tensor,
+    weight: Tensor | None,
     profile: Profile,
     merging: Merging,
     highest: int,
     ones: bool,
-) -> tuple[Tensor, Tensor]:
-    """Gradients of ``values`` and ``coc``; ``out`` is what the forward pass gave if it was normalised."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of ``values``, ``coc`` and ``weight`` (empty without one).
+
+    ``out`` is what the forward pass gave if it was normalised.
+    """
     b, channels, h, w = values.shape
     shape = shape_tables(profile)
     bank = bank_of(merging, shape, slopes=True)
     source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
-    bounds = bounds_of(source)
+    weights = planes_of(weight, b)
     grad_values, grad_coc = torch.empty_like(source), torch.empty(b, 1, h, w)
+    grad_weight = torch.empty(b, *weights[0].shape)
     grad_np = grad.contiguous().numpy()
     divided = np.empty((b, 0, h, w), np.float32) if out is None else out.contiguous().numpy()
     for n in range(b):
         for group in range(-(-(channels + ones) // 4)):
-            picture, coc_of = source[n].numpy(), radii[n, 0]
+            scene = source[n].numpy(), radii[n, 0], weights[n]
             lanes = Lanes.of(group, channels, ones)
-            levels = collect(picture, coc_of, lanes, merging, bounds[n], highest)
+            levels = collect(*scene, lanes, merging, highest)
             incoming = np.empty((h, w, 4), np.float32)
             interleave = partial(_interleave, grad_np[n], divided[n], 4 * group, incoming)
             run_all(interleave, bands(h), "gradient of the picture")
@@ -250,11 +266,11 @@ def gather_merged(
             sums = _summed(incoming, bank.reach).reshape(-1)
             kernel = partial(
                 _gather_pixels,
-                *(picture, coc_of, *lanes, merging, levels.bounds, levels.sizes, sums, bank, shape),
-                *(grads, grad_values[n].numpy(), grad_coc[n, 0].numpy()),
+                *(*scene, *lanes, merging, levels.bounds, levels.sizes, sums, bank, shape),
+                *(grads, grad_values[n].numpy(), grad_coc[n, 0].numpy(), grad_weight[n].numpy()),
             )
             run_all(kernel, bands(h), "gather pixels")
-    return grad_values, grad_coc.to(coc.dtype)
+    return grad_values, grad_coc, grad_weight[:, None]
 
 
 def _summed(lanes: np.ndarray, pad: int) -> np.ndarray:

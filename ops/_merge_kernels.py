@@ -42,7 +42,7 @@ def _draw_wide(band, stride, pad, width, src, p, x, y, coc, shapes, bulge, inv_a
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _coarser(coarse, y, margin, line, fine):  # type: ignore[no-untyped-def]
+def coarser(coarse, y, margin, line, fine):  # type: ignore[no-untyped-def]
     """Row ``y`` of the finer level, interpolated as in `merge.upsample` from ``coarse (H, W, 4)`` and its margin.
 
     ``fine`` starts ``margin`` columns left of the picture.
@@ -104,12 +104,12 @@ def _cell_band(cells, reach, rows, level, bank, shape, coarse, out, band, y0, y1
     fine = np.zeros(8 * ((width + 1) >> 1), np.float32)
     for y in range(y0, y1):
         if coarse.shape[0] > 0:
-            _coarser(coarse, y - MARGIN, MARGIN, line, fine)
+            coarser(coarse, y - MARGIN, MARGIN, line, fine)
         running_sum(band, (y - y0) * stride, pad, fine, out[y].reshape(-1), width)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _lowest(values, coc, y, channel, constant, levels, shares, bank_steps, in_bank, pixels, energy, radii):  # type: ignore[no-untyped-def]
+def _lowest(values, coc, weight, y, channel, constant, levels, shares, bank_steps, in_bank, pixels, energy, radii):  # type: ignore[no-untyped-def]
     """What row ``y`` has on the lowest level: interleaved ``pixels``, and ``radii`` in steps of the bank.
 
     -1 stands for a pixel that has nothing there. ``shares`` and ``energy`` are used up.
@@ -119,6 +119,10 @@ def _lowest(values, coc, y, channel, constant, levels, shares, bank_steps, in_ba
         level = levels[x]
         shares[x] = one if level == zero else (one - shares[x] if level == one else zero)
         energy[x] = zero
+    if weight.shape[0] > 0:
+        weights = weight[y]
+        for x in range(len(weights)):
+            shares[x] *= weights[x]
     for k in range(4):
         lane = pixels[k:]
         if channel[k] >= 0:
@@ -140,14 +144,10 @@ def _lowest(values, coc, y, channel, constant, levels, shares, bank_steps, in_ba
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _pixel_band(  # type: ignore[no-untyped-def]
-    values, coc, channel, constant, merging, highest, bounds, reach, marks,
-    bank, shape, coarse, first_out, last, out, band, y0, y1
-):  # fmt: skip
-    """Rows ``y0 .. y1-1`` of the picture ``out``: the lowest level, the highlights, and all that is coarser.
-
-    The lanes go to the channels from ``first_out`` on. Where ``last >= 0``, they are divided by lane ``last``.
-    """
+def draw_pixels(  # type: ignore[no-untyped-def]
+    values, coc, weight, channel, constant, merging, highest, bounds, reach, marks, bank, shape, band, y0, y1
+):
+    """Draw the lowest level and the highlights into the rows ``y0 .. y1-1`` of ``band``."""
     bank_steps, mirrored, pad, firsts, ends, columns, weights, _ = bank
     shapes, bulge, inv_area = shape
     height, width = coc.shape
@@ -161,9 +161,9 @@ def _pixel_band(  # type: ignore[no-untyped-def]
         r = reach[y]
         if r < 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
-        classify(values, coc, y, merging, bounds, highest, levels, rest)
-        _lowest(values, coc, y, channel, constant, levels, rest, bank_steps, in_bank, pixels, energy, radii)
-        for x in range(width):
+        begin, end = classify(values, coc, weight, y, merging, bounds, highest, levels, rest)
+        _lowest(values, coc, weight, y, channel, constant, levels, rest, bank_steps, in_bank, pixels, energy, radii)
+        for x in range(begin, end):
             p = 4 * x
             k = int(radii[x])
             if k < 0:
@@ -172,10 +172,10 @@ def _pixel_band(  # type: ignore[no-untyped-def]
                 if coc[y, x] < 0.0:
                     k += mirrored
                 first = y + firsts[k]
-                begin = max(y0 - first, 0)
+                start = max(y0 - first, 0)
                 stop = min(y1 - first, ends[k + 1] - ends[k])
-                o = (first + begin - y0) * stride + 4 * (pad + x)
-                draw_rows(band, o, stride, pixels, p, columns, weights, ends[k] + begin, ends[k] + stop)
+                o = (first + start - y0) * stride + 4 * (pad + x)
+                draw_rows(band, o, stride, pixels, p, columns, weights, ends[k] + start, ends[k] + stop)
             else:
                 here = np.float64(coc[y, x])
                 signed = math.copysign(np.rint(bank_steps * abs(here)) / bank_steps, here)
@@ -190,17 +190,35 @@ def _pixel_band(  # type: ignore[no-untyped-def]
         for lane in range(4):
             if channel[lane] >= 0:
                 pixels[lane] = values[channel[lane], y, x]
+            if weight.shape[0] > 0:
+                pixels[lane] *= weight[y, x]
         signed = math.copysign(np.rint(bank_steps * abs(here)) / bank_steps, here)
         _draw_wide(
             *(band, stride, pad, width, pixels, 0, x, y, signed, shapes, bulge, inv_area, y0, y1),
             *(drawn, near, shares),
         )
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _pixel_band(  # type: ignore[no-untyped-def]
+    values, coc, weight, channel, constant, merging, highest, bounds, reach, marks,
+    bank, shape, coarse, first_out, last, out, band, y0, y1
+):  # fmt: skip
+    """Rows ``y0 .. y1-1`` of the picture ``out``: the lowest level, the highlights, and all that is coarser.
+
+    The lanes go to the channels from ``first_out`` on. Where ``last >= 0``, they are divided by lane ``last``.
+    """
+    draw_pixels(
+        *(values, coc, weight, channel, constant, merging, highest, bounds, reach, marks, bank, shape, band, y0, y1)
+    )
+    pad, width = bank[2], coc.shape[1]
+    pixels, rest = np.empty(4 * width, np.float32), np.empty(width, np.float32)
     line = np.empty(4 * coarse.shape[1], np.float32)
     fine = np.zeros(8 * ((width + 1) >> 1), np.float32)
     for y in range(y0, y1):
         if coarse.shape[0] > 0:
-            _coarser(coarse, y, 0, line, fine)
-        running_sum(band, (y - y0) * stride, pad, fine, pixels, width)
+            coarser(coarse, y, 0, line, fine)
+        running_sum(band, 4 * (y - y0) * (width + 2 * pad), pad, fine, pixels, width)
         rest[:] = np.float32(1.0)
         if last >= 0:
             lanes = pixels[last:]
@@ -219,13 +237,22 @@ def bank_of(merging: Merging, shape: tuple[np.ndarray, float, float], *, slopes:
     return psf_bank(2.0 * merging.cells * (1 + FADE), STEPS, *shape, slopes=slopes)
 
 
-def bounds_of(values: Tensor) -> np.ndarray:
-    """Mean of every channel ``(B, C)``, against which highlights are bright."""
-    return (torch.linalg.vector_norm(values, 1, (2, 3)) / (values.shape[2] * values.shape[3])).numpy()
+def planes_of(weight: Tensor | None, batch: int) -> list[np.ndarray]:
+    """The weight ``(H, W)`` of every picture; of no rows where there is none."""
+    if weight is None:
+        return [np.empty((0, 0), np.float32)] * batch
+    return list(weight.detach().contiguous()[:, 0].numpy())
 
 
 def splat_merged(
-    values: Tensor, coc: Tensor, profile: Profile, merging: Merging, highest: int, ones: bool, normalise: bool
+    values: Tensor,
+    coc: Tensor,
+    weight: Tensor | None,
+    profile: Profile,
+    merging: Merging,
+    highest: int,
+    ones: bool,
+    normalise: bool,
 ) -> Tensor:
     """`torchbokeh.ops.merge.splat_merged` for CPU float32."""
     b, channels, h, w = values.shape
@@ -233,30 +260,29 @@ def splat_merged(
         shape = shape_tables(profile)
         bank = bank_of(merging, shape)
     source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
-    with stage("mean"):
-        bounds = bounds_of(source)
+    weights = planes_of(weight, b)
     out = torch.empty(b, channels + ones, h, w)
     groups = -(-(channels + ones) // 4)
     last = channels + ones - 1 if normalise and groups == 1 else -1
     buffers: list[np.ndarray] = []
     for n in range(b):
         for group in range(groups):
-            picture, coc_of = source[n].numpy(), radii[n, 0]
+            scene = source[n].numpy(), radii[n, 0], weights[n]
             lanes = Lanes.of(group, channels, ones)
-            levels = collect(picture, coc_of, lanes, merging, bounds[n], highest)
-            coarse = _coarse(levels, bank, shape, buffers)
+            levels = collect(*scene, lanes, merging, highest)
+            coarse = coarse_picture(levels, bank, shape, buffers)
             kernel = partial(
                 _pixel_band,
-                *(picture, coc_of, *lanes, merging, highest, levels.bounds, levels.reach[0]),
+                *(*scene, *lanes, merging, highest, levels.bounds, levels.reach[0]),
                 *(levels.marks, bank, shape, coarse, 4 * group, last, out[n].numpy()),
             )
-            run_all(_buffered(kernel, w + 2 * bank.reach, buffers), bands(h), "picture")
+            run_all(buffered(kernel, w + 2 * bank.reach, buffers), bands(h), "picture")
     if normalise and groups > 1:
         out[:, :-1] /= out[:, -1:].clamp_min(TINY)
     return out
 
 
-def _coarse(
+def coarse_picture(
     levels: Levels, bank: Bank, shape: tuple[np.ndarray, float, float], buffers: list[np.ndarray]
 ) -> np.ndarray:
     """The picture ``(h + 2 MARGIN, w + 2 MARGIN, 4)`` of level 1 and all above it; of no rows if there are none."""
@@ -266,12 +292,12 @@ def _coarse(
         fine = np.empty((rows + 2 * MARGIN, across + 2 * MARGIN, 4), np.float32)
         cells, reach = levels.cells[RECORD * first :], levels.reach[level]
         kernel = partial(_cell_band, cells, reach, rows, level, bank, shape, coarse, fine)
-        run_all(_buffered(kernel, fine.shape[1] + 2 * bank.reach, buffers), bands(len(fine)), "levels")
+        run_all(buffered(kernel, fine.shape[1] + 2 * bank.reach, buffers), bands(len(fine)), "levels")
         coarse = fine
     return coarse
 
 
-def _buffered(kernel: Callable[..., None], columns: int, free: list[np.ndarray]) -> Callable[[int, int], None]:
+def buffered(kernel: Callable[..., None], columns: int, free: list[np.ndarray]) -> Callable[[int, int], None]:
     """Call ``kernel(buffer, y0, y1)`` with a buffer for a band that no other thread has.
 
     The buffers are used again: a fresh one for every band would cost more than what is drawn into it.

@@ -5,6 +5,7 @@ constant whatever the weights are, at silhouettes, between bins and at the image
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -79,3 +80,28 @@ def fill_until_full(bins: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tens
         taken = taken + counts
         total = total + coverage
     return mixed / taken.clamp_min(TINY), total
+
+
+def bin_weights(coc: Tensor, centres: Sequence[float], blend: float = 1.0) -> list[Tensor]:
+    """Share of every pixel in every bin; the shares of a pixel sum to 1.
+
+    Args:
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        centres: evenly spaced centres of the bins in px of CoC.
+        blend: how much of the way from one centre to the next pixels pass over on: with 1, the shares are hats.
+
+    Returns:
+        One ``(B, 1, H, W)`` for each centre.
+    """
+    if len(centres) == 1:
+        return [torch.ones_like(coc)]
+    place = (coc - centres[0]) / (centres[1] - centres[0])
+    # The outer bins lie at the smallest and the largest CoC of the scene and move with what has them, the sky say:
+    # its shares do not change, so no gradient runs through them.
+    half = 0.5 * (len(centres) - 1)
+    if place.requires_grad:
+        inside = (place - half).abs() < half - 1e-4
+        place = torch.where(inside, place, place.detach().clamp(0, 2 * half))
+    # What has passed on beyond each bin.
+    beyond = [((place - (k + 0.5)) / blend + 0.5).clamp_(0, 1) for k in range(len(centres) - 1)]
+    return [1 - beyond[0], *(a - b for a, b in pairwise(beyond)), beyond[-1]]

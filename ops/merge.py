@@ -71,15 +71,19 @@ def highest_level(largest: float, size: tuple[int, int], merging: Merging) -> in
     return min(math.floor(math.log2(largest / merging.cells)), room)
 
 
-def level_shares(values: Tensor, coc: Tensor, merging: Merging, highest: int) -> list[Tensor]:
+def level_shares(
+    values: Tensor, coc: Tensor, merging: Merging, highest: int, weight: Tensor | None = None
+) -> list[Tensor]:
     """Share ``(B, 1, H, W)`` of every pixel in the levels ``0 .. highest``; the shares of a pixel sum to 1.
 
     They are a choice, not a part of the picture: no gradient runs through them.
     """
     values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
-    mean = values.abs().mean((2, 3), keepdim=True)
+    holds = (values != 0).any(1, keepdim=True).to(values.dtype)
+    counted = holds if weight is None else holds * weight.detach()
+    mean = (values.abs() * counted).sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
-    ordinary = (values.abs() <= mean * bound).all(1, keepdim=True)
+    ordinary = ~(values.abs() > mean * bound).any(1, keepdim=True)
     above = [torch.ones_like(radius)]
     for level in range(1, highest + 1):
         excess = radius / (merging.cells * 2**level) - 1
@@ -88,13 +92,16 @@ def level_shares(values: Tensor, coc: Tensor, merging: Merging, highest: int) ->
     return [(above[k] - above[k + 1]).to(values.dtype) for k in range(highest + 1)]
 
 
-def merge_cells(values: Tensor, coc: Tensor, shares: list[Tensor]) -> list[tuple[Tensor, Tensor]]:
+def merge_cells(
+    values: Tensor, coc: Tensor, shares: list[Tensor], weight: Tensor | None = None
+) -> list[tuple[Tensor, Tensor]]:
     """The pictures that are splatted: values and signed CoC in cells, for every level.
 
     Args:
         values: ``(B, C, H, W)``.
         coc: ``(B, 1, H, W)`` signed radius in px.
         shares: those of `level_shares`.
+        weight: ``(B, 1, H, W)`` >= 0, factor of the values; a pixel counts by it in the mean radius. ``None``: 1.
 
     Returns:
         For level ``l`` the sums ``(B, C, h, w)`` over blocks of ``2**l x 2**l`` pixels, h and w rounded up, and the
@@ -108,10 +115,12 @@ def merge_cells(values: Tensor, coc: Tensor, shares: list[Tensor]) -> list[tuple
         def total(t: Tensor, size: int = size, border: tuple[int, ...] = border) -> Tensor:
             return F.avg_pool2d(F.pad(t, border), size) * size**2 if size > 1 else t
 
-        radius = total(share * coc.abs()) / total(share).clamp_min(TINY) / size
+        counted = share if weight is None else share * weight.detach()
+        radius = total(counted * coc.abs()) / total(counted).clamp_min(TINY) / size
         rounded = (radius.detach() * STEPS).round() / STEPS
         radius = radius + (rounded - radius.detach())
-        levels.append((total(values * share), torch.where(total(share * coc.detach()) < 0, -radius, radius)))
+        weighted = values * share if weight is None else values * (share * weight)
+        levels.append((total(weighted), torch.where(total(counted * coc.detach()) < 0, -radius, radius)))
     return levels
 
 
@@ -131,7 +140,12 @@ def upsample(coarse: Tensor) -> Tensor:
 
 
 def merged(
-    values: Tensor, coc: Tensor, splat: Callable[[Tensor, Tensor], Tensor], merging: Merging, highest: int
+    values: Tensor,
+    coc: Tensor,
+    splat: Callable[[Tensor, Tensor], Tensor],
+    merging: Merging,
+    highest: int,
+    weight: Tensor | None = None,
 ) -> Tensor:
     """Splat with merging, for any PSF.
 
@@ -142,11 +156,12 @@ def merged(
             ``(B, C, h, w)``.
         merging: how far to merge.
         highest: the coarsest level, see `highest_level`.
+        weight: ``(B, 1, H, W)`` >= 0, factor of the values. Pixels without weight do not take part.
 
     Returns:
-        ``(B, C, H, W)``, close to ``splat(values, coc)``.
+        ``(B, C, H, W)``, close to ``splat(weight * values, coc)``.
     """
-    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest))
+    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, weight), weight)
 
     def picture(level: int) -> Tensor:
         margin = MARGIN if level else 0
@@ -166,6 +181,7 @@ def splat_merged(
     merging: Merging,
     *,
     highest: int | None = None,
+    weight: Tensor | None = None,
     ones: bool = False,
     normalise: bool = False,
 ) -> Tensor:
@@ -177,7 +193,9 @@ def splat_merged(
         profile: the unit shape of the PSF, see `torchbokeh.psfs.aperture`.
         merging: how far to merge.
         highest: the coarsest level; ``None`` looks at ``coc`` once.
-        ones: splat a channel of ones as well, the coverage, and put it last.
+        weight: ``(B, 1, H, W)`` >= 0, factor of the values. Pixels without weight do not take part: they get no
+            gradient.
+        ones: splat a channel of ones as well, times the weight: the coverage. It is put last.
         normalise: divide the values by the last channel, the coverage.
 
     Returns:
@@ -201,18 +219,21 @@ def splat_merged(
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_image("profile.knots", profile.knots, ("K", 3), like=values)
     check_image("profile.bulge", profile.bulge, (), like=values)
+    if weight is not None:
+        check_image("weight", weight, (b, 1, h, w), like=values)
     if highest is None:
         highest = highest_level(float(coc.detach().abs().max()) if coc.numel() else 0.0, (h, w), merging)
     dtype = compute_dtype(values, coc)
     source, radius = values.to(dtype), coc.to(dtype)
+    weight = None if weight is None else weight.to(dtype)
     fixed = not (profile.knots.requires_grad or profile.bulge.requires_grad)
     if has_kernel(source) and fixed and source.numel():
         knots, bulge = profile.knots.double(), profile.bulge.double()
-        out = _splat_merged_op(source, radius, knots, bulge, *merging, highest, ones, normalise)
+        out = _splat_merged_op(source, radius, weight, knots, bulge, *merging, highest, ones, normalise)
     else:
         if ones:
             source = torch.cat([source, torch.ones_like(radius)], 1)
-        out = merged(source, radius, lambda v, r: splat_spans(v, r, profile, integrate=True), merging, highest)
+        out = merged(source, radius, lambda v, r: splat_spans(v, r, profile, integrate=True), merging, highest, weight)
         if normalise:
             out = torch.cat([out[:, :-1] / out[:, -1:].clamp_min(TINY), out[:, -1:]], 1)
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
@@ -222,6 +243,7 @@ def splat_merged(
 def _splat_merged_op(
     values: Tensor,
     coc: Tensor,
+    weight: Tensor | None,
     knots: Tensor,
     bulge: Tensor,
     cells: float,
@@ -233,13 +255,14 @@ def _splat_merged_op(
     from torchbokeh.ops import _merge_kernels
 
     merging = Merging(cells, highlight)
-    return _merge_kernels.splat_merged(values, coc, Profile(knots, bulge), merging, highest, ones, normalise)
+    return _merge_kernels.splat_merged(values, coc, weight, Profile(knots, bulge), merging, highest, ones, normalise)
 
 
 @_splat_merged_op.register_fake
 def _(
     values: Tensor,
     coc: Tensor,
+    weight: Tensor | None,
     knots: Tensor,
     bulge: Tensor,
     cells: float,
@@ -258,17 +281,18 @@ def _gather_merged_op(
     out: Tensor | None,
     values: Tensor,
     coc: Tensor,
+    weight: Tensor | None,
     knots: Tensor,
     bulge: Tensor,
     cells: float,
     highlight: float,
     highest: int,
     ones: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     from torchbokeh.ops import _merge_gather
 
     merging = Merging(cells, highlight)
-    return _merge_gather.gather_merged(grad, out, values, coc, Profile(knots, bulge), merging, highest, ones)
+    return _merge_gather.gather_merged(grad, out, values, coc, weight, Profile(knots, bulge), merging, highest, ones)
 
 
 @_gather_merged_op.register_fake
@@ -277,15 +301,17 @@ def _(
     out: Tensor | None,
     values: Tensor,
     coc: Tensor,
+    weight: Tensor | None,
     knots: Tensor,
     bulge: Tensor,
     cells: float,
     highlight: float,
     highest: int,
     ones: bool,
-) -> tuple[Tensor, Tensor]:
-    like = torch.contiguous_format
-    return torch.empty_like(values, memory_format=like), torch.empty_like(coc, memory_format=like)
+) -> tuple[Tensor, Tensor, Tensor]:
+    b, _, h, w = values.shape
+    by_weight = values.new_empty((b, 1, 0, 0) if weight is None else (b, 1, h, w))
+    return torch.empty_like(values, memory_format=torch.contiguous_format), values.new_empty(b, 1, h, w), by_weight
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -296,7 +322,8 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *tensors, out = ctx.saved_tensors
-    return (*_gather_merged_op(grad, out, *tensors, *ctx.settings), *[None] * 7)
+    by_values, by_coc, by_weight = _gather_merged_op(grad, out, *tensors, *ctx.settings)
+    return by_values, by_coc, None if tensors[2] is None else by_weight, *[None] * 7
 
 
 _splat_merged_op.register_autograd(_backward, setup_context=_setup)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops.composite import TINY, fill_until_full, pull_push
+from torchbokeh.ops.composite import TINY, bin_weights, fill_until_full, pull_push
 from torchbokeh.ops.spans import Profile, area
 from torchbokeh.ops.splat import splat_spans
 
@@ -50,19 +50,6 @@ def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
     if count == 1:
         return (0.5 * (low + high),)
     return tuple(low + (high - low) * k / (count - 1) for k in range(count))
-
-
-def bin_weights(coc: Tensor, centres: Sequence[float]) -> list[Tensor]:
-    """Share of every pixel in every bin: a hat over the two nearest centres. The shares of a pixel sum to 1."""
-    if len(centres) == 1:
-        return [torch.ones_like(coc)]
-    place = (coc - centres[0]) / (centres[1] - centres[0])
-    # The outer bins lie at the smallest and the largest CoC of the scene and move with what has them, the sky say:
-    # its shares do not change, so no gradient runs through them.
-    half = 0.5 * (len(centres) - 1)
-    inside = (place - half).abs() < half - 1e-4
-    place = torch.where(inside, place, place.detach().clamp(0, 2 * half))
-    return [(1 - (place - k).abs()).clamp_min(0) for k in range(len(centres))]
 
 
 def split_foreground(
