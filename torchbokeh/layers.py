@@ -14,14 +14,19 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.ops.composite import TINY, bin_weights, fill_until_full, pull_push
+from torchbokeh.ops.merge import Merging, splat_merged
 from torchbokeh.ops.spans import Profile, area
 from torchbokeh.ops.splat import splat_spans
+from torchbokeh.ops.surface import blur_surface
 
 FOREGROUND = (-2.0, -1.0)
 """Signed CoC (px) between which a pixel passes from foreground to rest. What is sharper hides nothing."""
 
 SPACING = 6.0
 """Distance of the bins in px of CoC. Closer ones change the picture little: what counts is what hides what."""
+
+COARSE = 4
+"""Where pixels are merged, what is hidden is filled in blocks of this many pixels each way."""
 
 CERTAIN = 4.0
 """Views of a surface that splats cover to one over this count fully: splats of varying blur thin out, holes do not."""
@@ -53,7 +58,11 @@ def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
 
 
 def split_foreground(
-    image: Tensor, coc: Tensor, behind: tuple[Tensor, Tensor | None] | None, centres: Sequence[tuple[float, ...]]
+    image: Tensor,
+    coc: Tensor,
+    behind: tuple[Tensor, Tensor | None] | None,
+    centres: Sequence[tuple[float, ...]],
+    scale: int = 1,
 ) -> list[Surface]:
     """What stands in front of the focus plane, and the rest with the hidden part filled in.
 
@@ -66,25 +75,61 @@ def split_foreground(
         coc: ``(B, 1, H, W)`` signed radius in px.
         behind: what the foreground hides, as colour and CoC; ``None`` for what is not known.
         centres: bins of the foreground and of the rest.
+        scale: fill in blocks of ``scale**2`` pixels: what is hidden is smooth, and blurred in the end. Above 1, the
+            CoC of the foreground is not continued beyond it.
     """
-    start, stop = FOREGROUND
-    front = ((stop - coc) / (stop - start)).clamp(0, 1)
-    known = 1 - F.max_pool2d(front, 3, 1, 1)
+    front, known = front_and_known(coc)
     colour, behind_coc = (None, None) if behind is None else behind
-    # Where the foreground is beside everything, those pixels are all there is; elsewhere the second weight is nothing.
-    last_resort = 1e-9 * (1 - front)
-    if colour is None:
-        weight = torch.maximum(known * _ordinary(image, known), last_resort)
-        planes = (t.flatten(0, 1)[:, None] for t in (image, weight))
-        colour = pull_push(*planes).reshape(image.shape)
-    if behind_coc is None:
-        behind_coc = pull_push(coc, torch.maximum(known, last_resort))
+    if colour is None or behind_coc is None:
+        filled, filled_coc = _surroundings(image, coc, front, known, scale)
+        colour = filled if colour is None else colour
+        behind_coc = filled_coc if behind_coc is None else behind_coc
     rest = known * image + (1 - known) * colour
     rest_coc = known * coc + (1 - known) * behind_coc
     return [
-        Surface(image * front, front, continued(coc, front), centres[0]),
+        Surface(image * front, front, continued(coc, front) if scale == 1 else coc, centres[0]),
         Surface(rest, None, rest_coc, centres[1]),
     ]
+
+
+def front_and_known(coc: Tensor) -> tuple[Tensor, Tensor]:
+    """Share ``(B, 1, H, W)`` of every pixel in the foreground, and of the rest in what is seen of it.
+
+    What is beside the foreground holds some of its colour, so it counts as hidden.
+    """
+    start, stop = FOREGROUND
+    front = ((stop - coc) / (stop - start)).clamp(0, 1)
+    return front, 1 - F.max_pool2d(front, 3, 1, 1)
+
+
+def _surroundings(image: Tensor, coc: Tensor, front: Tensor, known: Tensor, scale: int) -> tuple[Tensor, Tensor]:
+    """Colour and CoC of what is hidden, filled in from its surroundings, in blocks of ``scale**2`` pixels."""
+    # Where the foreground is beside everything, those pixels are all there is; elsewhere the second weight is nothing.
+    weight = torch.maximum(known, 1e-9 * (1 - front))
+    if scale == 1:
+        return fill_hidden(image, coc, weight)
+    share, total, total_coc = (block_means(t, scale) for t in (weight, weight * image, weight * coc))
+    filled = fill_hidden(total / share.clamp_min(TINY), total_coc / share.clamp_min(TINY), share)
+    colour, behind = (enlarged(t, scale, coc.shape[2:]) for t in filled)
+    return colour, behind
+
+
+def fill_hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill colour and CoC by pull-push from where ``weight (B, 1, H, W)`` is; highlights do not spread."""
+    ordinary = torch.maximum(weight * _ordinary(image, weight), 1e-9 * weight)
+    planes = (t.flatten(0, 1)[:, None] for t in (image, ordinary))
+    return pull_push(*planes).reshape(image.shape), pull_push(coc, weight)
+
+
+def block_means(t: Tensor, size: int) -> Tensor:
+    """Means over blocks of ``size**2`` pixels; what a block lacks at the border is 0."""
+    return F.avg_pool2d(F.pad(t, (0, -t.shape[3] % size, 0, -t.shape[2] % size)), size)
+
+
+def enlarged(t: Tensor, scale: int, size: tuple[int, ...]) -> Tensor:
+    """A picture of block means, interpolated bilinearly to ``size`` pixels."""
+    large = F.interpolate(t, scale_factor=scale, mode="bilinear", align_corners=False)
+    return large[..., : size[0], : size[1]]
 
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:
@@ -101,30 +146,58 @@ def continued(coc: Tensor, alpha: Tensor) -> Tensor:
     return torch.where(here > 0, coc, pull_push(torch.where(here > 0, coc, 0.0), here))
 
 
-def blurred(surface: Surface, profile: Profile) -> tuple[Tensor, Tensor, Tensor]:
-    """One surface through one sub-aperture.
+def blurred(
+    surface: Surface, profile: Profile, merging: Merging | None = None, highest: int = 0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One surface through one sub-aperture, exact or merged by radius.
 
     Returns:
         The mean colour ``(B, C, H, W)``, the share ``(B, 1, H, W)`` of the light that the surface stops, and the
         density of its splats: 1 where blur is even, more or less where it varies, 0 where the picture does not know
         the surface, beyond the border or behind something else.
     """
-    c = surface.colour.shape[1]
-    alpha = torch.ones_like(surface.coc) if surface.alpha is None else surface.alpha
-    source = torch.cat([surface.colour, alpha], 1)
+    alpha = surface.alpha
+    if merging is not None:
+        plain = surface.colour if alpha is None else surface.colour / alpha.clamp_min(TINY)
+        colour, coverage = blur_surface(plain, alpha, surface.coc, surface.centres, profile, merging, highest)
+        if alpha is None:
+            return colour, torch.ones_like(coverage), coverage
+        whole = _density(surface.coc, alpha, profile, merging)
+        return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
+    source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
     bins = []
     for weight in bin_weights(surface.coc, surface.centres):
         splat = splat_spans(source * weight, surface.coc, profile, integrate=True)
-        bins.append((splat[:, :c], splat[:, c:]))
+        bins.append((splat[:, :-1], splat[:, -1:]))
     colour, coverage = fill_until_full(bins)
-    if surface.alpha is None:
+    if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.
     whole = splat_spans(torch.ones_like(alpha), surface.coc, profile, integrate=True).clamp_min(0)
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 
-def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Tensor, Tensor]:
+def _density(coc: Tensor, alpha: Tensor, profile: Profile, merging: Merging) -> Tensor:
+    """Density of the splats of a surface without holes, from blocks of pixels: it is smooth."""
+    return enlarged(small_density(*block_sums(coc, alpha), profile, merging), COARSE, coc.shape[2:])
+
+
+def block_sums(coc: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """For blocks of ``COARSE**2`` pixels, the mean CoC of what has any ``alpha``, and the share of that."""
+    here = (alpha > 0).to(coc.dtype)
+    share = block_means(here, COARSE)
+    return block_means(here * coc, COARSE) / share.clamp_min(TINY), share
+
+
+def small_density(coc: Tensor, share: Tensor, profile: Profile, merging: Merging) -> Tensor:
+    """Density of the splats of blocks, with their CoC (px) continued to where ``share`` is 0."""
+    whole = continued(coc, share) / COARSE
+    return splat_merged(torch.ones_like(whole), whole, profile, merging).clamp_min(0)
+
+
+def compose(
+    surfaces: Sequence[Surface], pieces: Sequence[Profile], merging: Merging | None = None, highest: int = 0
+) -> tuple[Tensor, Tensor]:
     """Blur all surfaces and put them over one another, front to back, for every sub-aperture.
 
     Through one small piece of the lens, what is in front covers what is behind almost as in a pinhole picture; the
@@ -135,6 +208,8 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
     Args:
         surfaces: front to back.
         pieces: the sub-apertures, see `torchbokeh.ops.spans.subdivide`.
+        merging: how far to merge by radius; ``None``: not at all.
+        highest: the coarsest level to merge on.
 
     Returns:
         Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``, 1 where something opaque is behind.
@@ -147,7 +222,7 @@ def compose(surfaces: Sequence[Surface], pieces: Sequence[Profile]) -> tuple[Ten
         votes = crowd = zero
         left = zero + area(profile).to(zero.dtype)
         for surface in surfaces:
-            mean, stopped, density = blurred(surface, profile)
+            mean, stopped, density = blurred(surface, profile, merging, highest)
             known = (CERTAIN * density).clamp(max=1)
             vote = left * stopped * known
             seen = seen + vote * mean

@@ -1,27 +1,27 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
+from dataclasses import replace
 from numbers import Real
 
 import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc, signed_map
-from torchbokeh.layers import FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
+from torchbokeh.layers import COARSE, FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.ops.merge import Merging, highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, subdivide
 from torchbokeh.plan import Hidden, Plan
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
 Background = Tensor | tuple[Tensor, Tensor] | None
 
-MOST_BINS = 8
-"""Soft bins of a surface where ``layers="auto"``."""
-
 
 class LensBlur(nn.Module):
-    """Depth of field, exact: every pixel spreads over its circle of confusion, near surfaces cover far ones.
+    """Depth of field: every pixel spreads over its circle of confusion, near surfaces cover far ones.
 
     A first look at the scene makes a `Plan` of what it needs; only that is done. A plain image is split into what
     stands in front of the focus plane and the rest, whose hidden part is filled in or given by the caller. Input in
@@ -32,11 +32,14 @@ class LensBlur(nn.Module):
         lens: turns depth into signed CoC; may be left out if ``coc=`` is passed to every call.
         aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
         layers: most soft bins of constant parallax per surface, or ``"auto"``.
-        quality: ``"exact"``.
+        quality: ``"exact"``, ``"high"``, ``"balanced"`` or ``"fast"``. All but the first merge wide PSFs by radius, so
+            that more blur costs less (`torchbokeh.ops.merge`); the last two also compose more coarsely, see
+            `torchbokeh.quality.Quality`.
+        tolerance: relative L1 error of the splats to keep to, as far as it can be predicted; picks the quality instead.
         max_coc: largest radius in px; larger ones are cut to it. ``None``: no limit.
         subapertures: the lens is cut into ``subapertures**2`` pieces that are composed one by one, which keeps the
-            relation of coverage and lens position where blurred surfaces overlap. ``"auto"``: 3 where all that is
-            hidden is known, 2 where it is guessed, 1 where nothing hides anything.
+            relation of coverage and lens position where blurred surfaces overlap. ``"auto"``: at the two best
+            qualities, 3 where all that is hidden is known and 2 where it is guessed; 1 where nothing hides anything.
 
     Raises:
         TypeError: an argument of the wrong kind.
@@ -58,14 +61,14 @@ class LensBlur(nn.Module):
         layers: int | str = "auto",
         quality: str = "exact",
         *,
+        tolerance: float | None = None,
         max_coc: float | None = None,
         subapertures: int | str = "auto",
     ) -> None:
         super().__init__()
         if lens is not None and not isinstance(lens, Lens):
             raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
-        if quality != "exact":
-            raise ValueError(f"quality: expected 'exact', got {quality!r}")
+        check_quality(quality, tolerance)
         if max_coc is not None and (not isinstance(max_coc, Real) or isinstance(max_coc, bool)):
             raise TypeError(f"max_coc: expected a number or None, got {max_coc!r}")
         if max_coc is not None and not max_coc > 0:
@@ -74,14 +77,15 @@ class LensBlur(nn.Module):
         self.aperture = parse_aperture(aperture)
         self.layers = _count("layers", layers)
         self.quality = quality
+        self.tolerance = tolerance
         self.max_coc = max_coc
         self.subapertures = _count("subapertures", subapertures)
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
         return (
-            f"layers={self.layers or 'auto'}, quality={self.quality!r}, max_coc={self.max_coc}, "
-            f"subapertures={self.subapertures or 'auto'}"
+            f"layers={self.layers or 'auto'}, quality={self.quality!r}, tolerance={self.tolerance}, "
+            f"max_coc={self.max_coc}, subapertures={self.subapertures or 'auto'}"
         )
 
     def plan(
@@ -103,9 +107,11 @@ class LensBlur(nn.Module):
             if image.dim() == 5:
                 return self._plan_layers(image, signed, cut)
             *_, height, width = image.shape
-            low, high, clamped = torch.stack([*signed.aminmax(), cut.to(signed.dtype).mean()]).tolist()
+            look = [*signed.aminmax(), cut.to(signed.dtype).mean(), *self._shares(signed)]
+            low, high, clamped, *shares = torch.stack(look).tolist()
+            quality, error = choose(self.quality, self.tolerance, shares)
             start, stop = FOREGROUND
-            most = self.layers or MOST_BINS
+            most = self.layers or quality.bins
             in_front = low < stop and high > start and high - low > 1
             hidden: Hidden = "nothing"
             bins: tuple[tuple[float, ...], ...]
@@ -115,7 +121,10 @@ class LensBlur(nn.Module):
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
-            return self._finish((height, width), (low, high), clamped, 0, (), hidden, bins, occludes)
+            return self._finish((height, width), (low, high), clamped, 0, (), hidden, bins, occludes, quality, error)
+
+    def _shares(self, signed: Tensor) -> list[Tensor]:
+        return merged_shares(signed, self.quality, self.tolerance)
 
     def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor) -> Plan:
         *_, height, width = image.shape
@@ -123,14 +132,17 @@ class LensBlur(nn.Module):
         low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
         high = torch.where(held, signed, -torch.inf).movedim(1, 0).flatten(1).amax(1)
         share = (cut & held).sum() / held.sum().clamp_min(1)
-        *bounds, clamped = torch.cat([low, high, share[None].to(low.dtype)]).tolist()
+        shares = self._shares(torch.where(held, signed, 0.0))
+        look = torch.cat([low, high, torch.stack([share.to(low.dtype), *shares])]).tolist()
+        bounds, (clamped, *merged) = look[: -len(QUALITIES) - 1], look[-len(QUALITIES) - 1 :]
+        quality, error = choose(self.quality, self.tolerance, merged)
         count = image.shape[1]
         kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
-        most = self.layers or MOST_BINS
+        most = self.layers or quality.bins
         bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
         span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
         occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        return self._finish((height, width), span, clamped, count, kept, "layers", bins, occludes)
+        return self._finish((height, width), span, clamped, count, kept, "layers", bins, occludes, quality, error)
 
     def _finish(
         self,
@@ -142,6 +154,8 @@ class LensBlur(nn.Module):
         hidden: Hidden,
         bins: tuple[tuple[float, ...], ...],
         occludes: bool,
+        quality: Quality,
+        error: float,
     ) -> Plan:
         largest = max(abs(span[0]), abs(span[1]))
         if self.subapertures is not None:
@@ -149,9 +163,18 @@ class LensBlur(nn.Module):
         elif not occludes or largest < 3:
             pieces = 1
         else:
-            pieces = 3 if hidden in ("given", "layers") else 2
+            pieces = quality.subapertures[hidden in ("given", "layers")]
+        merging = quality.merging
+        highest = 0 if merging is None else highest_level(largest, size, self._finer(merging, pieces))
         sharp = largest <= MIN_RADIUS and hidden != "layers"
-        return Plan(size, span, clamped, sharp, count, kept, hidden, bins, pieces, repr(self.aperture))
+        error = error if highest else 0.0
+        aperture = repr(self.aperture)
+        return Plan(size, span, clamped, sharp, count, kept, hidden, bins, pieces, aperture, quality, highest, error)
+
+    @staticmethod
+    def _finer(merging: Merging, pieces: int) -> Merging:
+        """A piece of the lens has PSFs that are smaller by the number of pieces each way."""
+        return merging._replace(cells=merging.cells * pieces)
 
     def forward(
         self,
@@ -192,17 +215,28 @@ class LensBlur(nn.Module):
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
+            merging = plan.quality.merging
+            if merging is not None:
+                merging = self._finer(merging, plan.subapertures)
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             if image.dim() == 5:
                 surfaces = [
-                    Surface(source[:, k, :3], source[:, k, 3:], continued(radii[:, k], source[:, k, 3:]), bins)
+                    Surface(source[:, k, :3], source[:, k, 3:], radii[:, k], bins)
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
-                out = torch.cat(compose(surfaces, pieces), 1) if surfaces else torch.zeros_like(source[:, 0])
+                if merging is None:
+                    surfaces = [replace(s, coc=continued(s.coc, s.alpha)) for s in surfaces if s.alpha is not None]
+                out = (
+                    torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
+                    if surfaces
+                    else torch.zeros_like(source[:, 0])
+                )
             elif len(plan.bins) == 2:
-                out, _ = compose(split_foreground(source, radii, behind, plan.bins), pieces)
+                scale = COARSE if plan.quality.coarse else 1
+                surfaces = split_foreground(source, radii, behind, plan.bins, scale)
+                out, _ = compose(surfaces, pieces, merging, plan.highest)
             else:
-                out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces)
+                out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces, merging, plan.highest)
         return out.to(image.dtype)
 
     def _inputs(

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from torchbokeh.quality import Quality
+
 Hidden = Literal["nothing", "filled", "given", "layers"]
 
 _HIDDEN = {
@@ -26,6 +28,9 @@ class Plan:
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
         aperture: the shape of the aperture, for the reader.
+        quality: the operating point.
+        highest: the coarsest level that pixels are merged on; 0 if none are.
+        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
     """
 
     size: tuple[int, int]
@@ -38,6 +43,9 @@ class Plan:
     bins: tuple[tuple[float, ...], ...]
     subapertures: int
     aperture: str
+    quality: Quality
+    highest: int
+    predicted_error: float
 
     def __str__(self) -> str:
         height, width = self.size
@@ -59,6 +67,13 @@ class Plan:
             lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
         else:
             lines.append(f"{self.aperture}, whole: nothing hides anything, or the blur is too small to show it.")
+        if self.highest:
+            lines.append(
+                f"Quality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
+                f"merged by radius; predicted relative error of the splats {self.predicted_error:.2g}."
+            )
+        elif self.quality.merging is not None:
+            lines.append(f"Quality {self.quality.name!r}: the blur is too small for pixels to be merged.")
         if self.clamped:
             lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
         return "\n".join(lines)

@@ -17,18 +17,24 @@ class Quality(NamedTuple):
         merging: how far pixels are merged by radius, see `torchbokeh.ops.merge`; ``None`` for not at all.
         error: the largest relative L1 error against the exact splat that was seen on the procedural recipes, at radii
             from 12 to 80 px. `torchbokeh report` measures it anew.
+        bins: most soft bins of a surface in a composition.
+        subapertures: most pieces of the lens each way where hidden content is guessed, and where it is known.
+        coarse: hidden content is filled in blocks of pixels.
     """
 
     name: str
     merging: Merging | None
     error: float
+    bins: int
+    subapertures: tuple[int, int]
+    coarse: bool
 
 
 QUALITIES = (
-    Quality("exact", None, 0.0),
-    Quality("high", Merging(8.0, 0.005), 0.005),
-    Quality("balanced", Merging(4.0, 0.015), 0.016),
-    Quality("fast", Merging(2.5, 0.03), 0.03),
+    Quality("exact", None, 0.0, 8, (2, 3), False),
+    Quality("high", Merging(8.0, 0.005), 0.005, 8, (2, 3), False),
+    Quality("balanced", Merging(4.0, 0.015), 0.016, 3, (1, 2), True),
+    Quality("fast", Merging(2.5, 0.03), 0.03, 2, (1, 1), True),
 )
 """All operating points, from the most exact to the fastest."""
 

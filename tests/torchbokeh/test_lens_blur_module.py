@@ -126,7 +126,7 @@ BAD_ARGUMENTS = [
     ({"layers": 2.0}, TypeError, "layers: expected an int or 'auto', got 2.0"),
     ({"subapertures": -1}, ValueError, "subapertures: expected at least 1, got -1"),
     ({"subapertures": True}, TypeError, "subapertures: expected an int or 'auto', got True"),
-    ({"quality": "fast"}, ValueError, "quality: expected 'exact', got 'fast'"),
+    ({"quality": "best"}, ValueError, "quality: expected one of 'exact', 'high', 'balanced', 'fast', got 'best'"),
     ({"max_coc": 0}, ValueError, "max_coc: expected a radius in px above 0, got 0"),
     ({"max_coc": -3.0}, ValueError, "max_coc: expected a radius in px above 0, got -3.0"),
     ({"max_coc": float("nan")}, ValueError, "max_coc: expected a radius in px above 0, got nan"),

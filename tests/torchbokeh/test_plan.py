@@ -8,7 +8,7 @@ from torch import Tensor
 import torchbokeh as tb
 from torchbokeh import LensBlur, Plan
 from torchbokeh.layers import FOREGROUND
-from torchbokeh.lens_blur import MOST_BINS
+from torchbokeh.quality import QUALITIES
 
 
 def picture(channels: int = 3, height: int = 24, width: int = 32) -> Tensor:
@@ -177,7 +177,7 @@ def test_how_finely_the_lens_is_cut_for_layers() -> None:
     assert side(8) == 1
 
 
-@pytest.mark.parametrize(("layers", "most"), [("auto", MOST_BINS), (1, 1), (3, 3), (20, 20)])
+@pytest.mark.parametrize(("layers", "most"), [("auto", QUALITIES[0].bins), (1, 1), (3, 3), (20, 20)])
 def test_the_number_of_bins_is_limited(layers: Any, most: int) -> None:
     blur = LensBlur(layers=layers)
     assert [len(b) for b in blur.plan(picture(), coc=halves(-500, 500)).bins] == [most, most]
