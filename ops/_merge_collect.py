@@ -221,7 +221,7 @@ def usual(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     sums = np.empty((values.shape[1], len(values) + 1))
     run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
     *totals, count = sums.sum(0)
-    return np.float32(totals) / np.float32(max(count, TINY))
+    return (np.array(totals) / max(count, TINY)).astype(np.float32)
 
 
 def collect(

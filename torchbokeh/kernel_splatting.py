@@ -138,8 +138,9 @@ class KernelSplatting(nn.Module):
                 out = splat_spans(torch.cat([source, torch.ones_like(radius)], 1), radius, profile, integrate=True)
                 out = out[:, :-1] / out[:, -1:].clamp_min(TINY)
             else:
-                settings = {"highest": plan.highest, "ones": True, "normalise": True}
-                out = splat_merged(source, radius, profile, merging, **settings)[:, :-1]
+                out = splat_merged(source, radius, profile, merging, highest=plan.highest, ones=True, normalise=True)[
+                    :, :-1
+                ]
         return out.to(image.dtype)
 
     @staticmethod

@@ -162,7 +162,7 @@ def blurred(
         colour, coverage = blur_surface(plain, alpha, surface.coc, surface.centres, profile, merging, highest)
         if alpha is None:
             return colour, torch.ones_like(coverage), coverage
-        whole = _density(surface.coc, alpha, profile, merging)
+        whole = _density(surface.coc, alpha, profile, merging, highest)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
     source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
     bins = []
@@ -177,9 +177,9 @@ def blurred(
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 
-def _density(coc: Tensor, alpha: Tensor, profile: Profile, merging: Merging) -> Tensor:
+def _density(coc: Tensor, alpha: Tensor, profile: Profile, merging: Merging, highest: int) -> Tensor:
     """Density of the splats of a surface without holes, from blocks of pixels: it is smooth."""
-    return enlarged(small_density(*block_sums(coc, alpha), profile, merging), COARSE, coc.shape[2:])
+    return enlarged(small_density(*block_sums(coc, alpha), profile, merging, highest), COARSE, coc.shape[2:])
 
 
 def block_sums(coc: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,10 +189,41 @@ def block_sums(coc: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     return block_means(here * coc, COARSE) / share.clamp_min(TINY), share
 
 
-def small_density(coc: Tensor, share: Tensor, profile: Profile, merging: Merging) -> Tensor:
+def small_density(coc: Tensor, share: Tensor, profile: Profile, merging: Merging, highest: int) -> Tensor:
     """Density of the splats of blocks, with their CoC (px) continued to where ``share`` is 0."""
     whole = continued(coc, share) / COARSE
-    return splat_merged(torch.ones_like(whole), whole, profile, merging).clamp_min(0)
+    levels = max(highest - int(math.log2(COARSE)), 0)
+    return splat_merged(torch.ones_like(whole), whole, profile, merging, highest=levels).clamp_min(0)
+
+
+def foreground_over_rest(
+    image: Tensor,
+    coc: Tensor,
+    centres: Sequence[tuple[float, ...]],
+    profile: Profile,
+    merging: Merging,
+    highest: int,
+) -> Tensor:
+    """`compose` of `split_foreground` in blocks for the whole lens, in few passes; CPU float32, without gradients."""
+    from torchbokeh.ops import _foreground_kernels as kernels
+
+    out = torch.empty_like(image)
+    for n in range(len(image)):
+        scene = image[n].numpy(), coc[n, 0].numpy()
+        front, known, means = kernels.split(*scene, *FOREGROUND)
+        share, total_coc, here, total_here, *totals = torch.from_numpy(means)[:, None, None]
+        known_share = share.clamp_min(TINY)
+        hidden, hidden_coc = fill_hidden(torch.cat(totals, 1) / known_share, total_coc / known_share, share)
+        rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
+        picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
+        behind, density = blur_surface(picture, None, radius, centres[1], profile, merging, highest)
+        alpha = torch.from_numpy(front)[None, None]
+        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], centres[0], profile, merging, highest)
+        whole = small_density(total_here / here.clamp_min(TINY), here, profile, merging, highest)
+        planes = (t.numpy() for t in (whole[0, 0], behind[0], density[0, 0]))
+        kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), CERTAIN, *planes)
+        out[n] = behind[0]
+    return out
 
 
 def compose(

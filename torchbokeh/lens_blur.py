@@ -1,5 +1,6 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Real
 
@@ -7,12 +8,21 @@ import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc, signed_map
-from torchbokeh.layers import COARSE, FOREGROUND, Surface, bin_centres, compose, continued, split_foreground
+from torchbokeh.layers import (
+    COARSE,
+    FOREGROUND,
+    Surface,
+    bin_centres,
+    compose,
+    continued,
+    foreground_over_rest,
+    split_foreground,
+)
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
-from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.merge import Merging, highest_level
-from torchbokeh.ops.spans import MIN_RADIUS, subdivide
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
@@ -232,12 +242,29 @@ class LensBlur(nn.Module):
                     else torch.zeros_like(source[:, 0])
                 )
             elif len(plan.bins) == 2:
-                scale = COARSE if plan.quality.coarse else 1
-                surfaces = split_foreground(source, radii, behind, plan.bins, scale)
-                out, _ = compose(surfaces, pieces, merging, plan.highest)
+                out = self._over_rest(source, radii, behind, plan, pieces, merging)
             else:
                 out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces, merging, plan.highest)
         return out.to(image.dtype)
+
+    def _over_rest(
+        self,
+        image: Tensor,
+        radii: Tensor,
+        behind: tuple[Tensor, Tensor | None] | None,
+        plan: Plan,
+        pieces: Sequence[Profile],
+        merging: Merging | None,
+    ) -> Tensor:
+        coarse = plan.quality.coarse
+        asked = torch.is_grad_enabled() and any(
+            t.requires_grad for t in (image, radii, pieces[0].knots, pieces[0].bulge)
+        )
+        simple = behind is None and len(pieces) == 1 and image.shape[1] <= 3 and not asked
+        if merging is not None and coarse and simple and has_kernel(image):
+            return foreground_over_rest(image.detach(), radii.detach(), plan.bins, pieces[0], merging, plan.highest)
+        surfaces = split_foreground(image, radii, behind, plan.bins, COARSE if coarse else 1)
+        return compose(surfaces, pieces, merging, plan.highest)[0]
 
     def _inputs(
         self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background

@@ -48,7 +48,7 @@ def check_quality(quality: object, tolerance: object) -> None:
         return
     if not isinstance(tolerance, Real) or isinstance(tolerance, bool):
         raise TypeError(f"tolerance: expected a number or None, got {tolerance!r}")
-    if not tolerance >= 0:
+    if not float(tolerance) >= 0:
         raise ValueError(f"tolerance: expected a relative error of at least 0, got {tolerance}")
 
 
