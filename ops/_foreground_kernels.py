@@ -64,8 +64,8 @@ def _split(image, coc, start, stop, front, known, sums, y0, y1):  # type: ignore
 def split(image: np.ndarray, coc: np.ndarray, start: float, stop: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Front and known ``(H, W)`` of ``image (C, H, W)``, and means over blocks ``(4 + C, h, w)``.
 
-    The means are of the weight of what is known, times CoC, of what has any foreground, times CoC, and of the weight
-    times the image.
+    The means are of the weight of what is known, that times CoC, what has any foreground, that times CoC, and
+    the weight times the image.
     """
     channels, height, width = image.shape
     front, known = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
@@ -124,10 +124,24 @@ def rest(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _over(colour, coverage, front, whole, certain, behind, density, y0, y1):  # type: ignore[no-untyped-def]
+def _double(half, y, beyond, line, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of ``half`` with twice as many cells, as `merge.upsample`; it starts ``beyond`` cells outside."""
+    row = (y >> 1) + beyond
+    tilt = np.float32(-0.125 if y & 1 else 0.125)
+    above, here, below = half[row - 1], half[row], half[row + 1]
+    for x in range(len(line)):
+        line[x] = here[x] + tilt * (above[x] - below[x])
+    before, middle, after = line[beyond - 1 :], line[beyond:], line[beyond + 1 :]
+    for x in range(len(out) >> 1):
+        d = np.float32(0.125) * (before[x] - after[x])
+        out[2 * x], out[2 * x + 1] = middle[x] + d, middle[x] - d
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _over(colour, coverage, front, half, beyond, certain, behind, density, y0, y1):  # type: ignore[no-untyped-def]
     channels, _, width = colour.shape
     zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(TINY)
-    line, large = np.empty(whole.shape[1] + 2, np.float32), np.empty(BLOCK * whole.shape[1], np.float32)
+    line, large = np.empty(half.shape[1], np.float32), np.empty(width + (width & 1), np.float32)
     share, rest = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(y0, y1):
         covered, ahead, crowd = coverage[y], front[y], density[y]
@@ -136,10 +150,11 @@ def _over(colour, coverage, front, whole, certain, behind, density, y0, y1):  # 
             most = max(most, covered[x])
         if most == zero:
             continue
-        _enlarge(whole, y, line, large)
+        _double(half, y, beyond, line, large)
         for x in range(width):
-            stopped = min(covered[x] / max(large[x], tiny), one)
-            known = min(certain * large[x], one)
+            whole = max(large[x], zero)
+            stopped = min(covered[x] / max(whole, tiny), one)
+            known = min(certain * whole, one)
             absent = one if ahead[x] == zero else zero
             vote = stopped * known
             left = (absent + known * (one - stopped - absent)) * min(certain * crowd[x], one)
@@ -155,11 +170,12 @@ def over(
     colour: np.ndarray,
     coverage: np.ndarray,
     front: np.ndarray,
-    whole: np.ndarray,
+    half: np.ndarray,
+    beyond: int,
     certain: float,
     behind: np.ndarray,
     density: np.ndarray,
 ) -> None:
     """Put a foreground over ``behind (C, H, W)``, in place, as `torchbokeh.layers.compose` does for the whole lens."""
-    work = partial(_over, colour, coverage, front, whole, np.float32(certain), behind, density)
+    work = partial(_over, colour, coverage, front, half, beyond, np.float32(certain), behind, density)
     run_all(work, bands(len(front)), "over")

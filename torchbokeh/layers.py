@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.ops.composite import TINY, bin_weights, fill_until_full, pull_push
-from torchbokeh.ops.merge import Merging, splat_merged
+from torchbokeh.ops.merge import MARGIN, Merging, splat_merged, upsample
 from torchbokeh.ops.spans import Profile, area
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.ops.surface import blur_surface
@@ -27,6 +27,9 @@ SPACING = 6.0
 
 COARSE = 4
 """Where pixels are merged, what is hidden is filled in blocks of this many pixels each way."""
+
+BEYOND = 2 * MARGIN
+"""Blocks of 2 x 2 pixels around a picture where `half_density` goes on."""
 
 CERTAIN = 4.0
 """Views of a surface that splats cover to one over this count fully: splats of varying blur thin out, holes do not."""
@@ -162,7 +165,9 @@ def blurred(
         colour, coverage = blur_surface(plain, alpha, surface.coc, surface.centres, profile, merging, highest)
         if alpha is None:
             return colour, torch.ones_like(coverage), coverage
-        whole = _density(surface.coc, alpha, profile, merging, highest)
+        half = half_density(*block_sums(surface.coc, alpha), profile, merging, highest)
+        h, w = coverage.shape[2:]
+        whole = upsample(half)[..., 2 * BEYOND : 2 * BEYOND + h, 2 * BEYOND : 2 * BEYOND + w].clamp_min(0)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
     source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
     bins = []
@@ -177,23 +182,27 @@ def blurred(
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 
-def _density(coc: Tensor, alpha: Tensor, profile: Profile, merging: Merging, highest: int) -> Tensor:
-    """Density of the splats of a surface without holes, from blocks of pixels: it is smooth."""
-    return enlarged(small_density(*block_sums(coc, alpha), profile, merging, highest), COARSE, coc.shape[2:])
-
-
 def block_sums(coc: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """For blocks of ``COARSE**2`` pixels, the mean CoC of what has any ``alpha``, and the share of that."""
+    """For blocks of ``COARSE**2`` pixels: the share with any ``alpha``, and that times CoC."""
     here = (alpha > 0).to(coc.dtype)
-    share = block_means(here, COARSE)
-    return block_means(here * coc, COARSE) / share.clamp_min(TINY), share
+    return block_means(here, COARSE), block_means(here * coc, COARSE)
 
 
-def small_density(coc: Tensor, share: Tensor, profile: Profile, merging: Merging, highest: int) -> Tensor:
-    """Density of the splats of blocks, with their CoC (px) continued to where ``share`` is 0."""
-    whole = continued(coc, share) / COARSE
-    levels = max(highest - int(math.log2(COARSE)), 0)
-    return splat_merged(torch.ones_like(whole), whole, profile, merging, highest=levels).clamp_min(0)
+def half_density(share: Tensor, total: Tensor, profile: Profile, merging: Merging, highest: int) -> Tensor:
+    """Density of the splats of a surface without holes, for blocks of 2 x 2 pixels and `BEYOND` of them around.
+
+    It is smooth, so it is splatted in blocks of 4 x 4. The CoC is continued to where the surface is not.
+
+    Args:
+        share: ``(B, 1, h, w)`` from `block_sums`, as is ``total``.
+        total: see ``share``.
+        profile: the unit shape of the PSF.
+        merging: how far to merge.
+        highest: the coarsest level of the whole picture.
+    """
+    coc = F.pad(continued(total / share.clamp_min(TINY), share) / COARSE, (MARGIN,) * 4, mode="replicate")
+    inside = F.pad(torch.ones_like(share), (MARGIN,) * 4)
+    return upsample(splat_merged(inside, coc, profile, merging, highest=max(highest - 2, 0)))
 
 
 def foreground_over_rest(
@@ -211,17 +220,17 @@ def foreground_over_rest(
     for n in range(len(image)):
         scene = image[n].numpy(), coc[n, 0].numpy()
         front, known, means = kernels.split(*scene, *FOREGROUND)
-        share, total_coc, here, total_here, *totals = torch.from_numpy(means)[:, None, None]
+        share, total_coc, *blocks, totals = torch.from_numpy(means)[None].split([1, 1, 1, 1, image.shape[1]], 1)
         known_share = share.clamp_min(TINY)
-        hidden, hidden_coc = fill_hidden(torch.cat(totals, 1) / known_share, total_coc / known_share, share)
+        hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
         rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
         picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
         behind, density = blur_surface(picture, None, radius, centres[1], profile, merging, highest)
         alpha = torch.from_numpy(front)[None, None]
         colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], centres[0], profile, merging, highest)
-        whole = small_density(total_here / here.clamp_min(TINY), here, profile, merging, highest)
-        planes = (t.numpy() for t in (whole[0, 0], behind[0], density[0, 0]))
-        kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), CERTAIN, *planes)
+        half = half_density(*blocks, profile, merging, highest)
+        planes = (t.contiguous().numpy() for t in (half[0, 0], behind[0], density[0, 0]))
+        kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
         out[n] = behind[0]
     return out
 

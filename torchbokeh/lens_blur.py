@@ -131,7 +131,9 @@ class LensBlur(nn.Module):
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
-            return self._finish((height, width), (low, high), clamped, 0, (), hidden, bins, occludes, quality, error)
+            return self._finish(
+                (height, width), (low, high), clamped, 0, ((), ()), hidden, bins, occludes, quality, error
+            )
 
     def _shares(self, signed: Tensor) -> list[Tensor]:
         return merged_shares(signed, self.quality, self.tolerance)
@@ -143,16 +145,20 @@ class LensBlur(nn.Module):
         high = torch.where(held, signed, -torch.inf).movedim(1, 0).flatten(1).amax(1)
         share = (cut & held).sum() / held.sum().clamp_min(1)
         shares = self._shares(torch.where(held, signed, 0.0))
-        look = torch.cat([low, high, torch.stack([share.to(low.dtype), *shares])]).tolist()
+        least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(low.dtype)
+        look = torch.cat([low, high, least, torch.stack([share.to(low.dtype), *shares])]).tolist()
         bounds, (clamped, *merged) = look[: -len(QUALITIES) - 1], look[-len(QUALITIES) - 1 :]
         quality, error = choose(self.quality, self.tolerance, merged)
         count = image.shape[1]
         kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
+        opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
         most = self.layers or quality.bins
         bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
         span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
         occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        return self._finish((height, width), span, clamped, count, kept, "layers", bins, occludes, quality, error)
+        return self._finish(
+            (height, width), span, clamped, count, (kept, opaque), "layers", bins, occludes, quality, error
+        )
 
     def _finish(
         self,
@@ -160,7 +166,7 @@ class LensBlur(nn.Module):
         span: tuple[float, float],
         clamped: float,
         count: int,
-        kept: tuple[int, ...],
+        kept: tuple[tuple[int, ...], tuple[int, ...]],
         hidden: Hidden,
         bins: tuple[tuple[float, ...], ...],
         occludes: bool,
@@ -179,7 +185,7 @@ class LensBlur(nn.Module):
         sharp = largest <= MIN_RADIUS and hidden != "layers"
         error = error if highest else 0.0
         aperture = repr(self.aperture)
-        return Plan(size, span, clamped, sharp, count, kept, hidden, bins, pieces, aperture, quality, highest, error)
+        return Plan(size, span, clamped, sharp, count, *kept, hidden, bins, pieces, aperture, quality, highest, error)
 
     @staticmethod
     def _finer(merging: Merging, pieces: int) -> Merging:
@@ -230,12 +236,16 @@ class LensBlur(nn.Module):
                 merging = self._finer(merging, plan.subapertures)
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             if image.dim() == 5:
+
+                def alpha(k: int) -> Tensor | None:
+                    return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
+
                 surfaces = [
-                    Surface(source[:, k, :3], source[:, k, 3:], radii[:, k], bins)
+                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins)
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
                 if merging is None:
-                    surfaces = [replace(s, coc=continued(s.coc, s.alpha)) for s in surfaces if s.alpha is not None]
+                    surfaces = [s if s.alpha is None else replace(s, coc=continued(s.coc, s.alpha)) for s in surfaces]
                 out = (
                     torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
                     if surfaces

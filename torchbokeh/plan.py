@@ -24,6 +24,7 @@ class Plan:
         sharp: every radius is below half a pixel: the image passes through.
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
+        opaque: indices of those that cover everything: their coverage needs no looking at.
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
@@ -39,6 +40,7 @@ class Plan:
     sharp: bool
     layer_count: int
     layers: tuple[int, ...]
+    opaque: tuple[int, ...]
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]
     subapertures: int

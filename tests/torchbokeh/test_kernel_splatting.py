@@ -1,0 +1,157 @@
+"""`KernelSplatting` against its functions, its plan, and what it refuses."""
+
+import dataclasses
+import doctest
+import math
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+import torchbokeh.kernel_splatting
+from torchbokeh import Disc, KernelSplatting, Polygon, SplattingPlan
+from torchbokeh.ops.merge import splat_merged
+from torchbokeh.ops.splat import splat_spans
+from torchbokeh.quality import QUALITIES
+
+NAMES = [q.name for q in QUALITIES]
+
+
+def scene(b: int = 1, c: int = 3, h: int = 60, w: int = 80, reach: float = 60.0) -> tuple[Tensor, Tensor]:
+    seed = torch.Generator().manual_seed(7)
+    image = torch.rand(b, c, h, w, generator=seed)
+    coc = torch.nn.functional.avg_pool2d((torch.rand(b, 1, h, w, generator=seed) * 2 - 1) * 8 * reach, 9, 1, 4)
+    return image, coc.clamp(-reach, reach)
+
+
+@pytest.mark.parametrize("quality", QUALITIES, ids=NAMES)
+@pytest.mark.parametrize("aperture", [Disc(), Polygon(5, 0.3)], ids=["disc", "pentagon"])
+def test_it_is_its_function(quality: Any, aperture: Disc) -> None:
+    image, coc = scene(2)
+    got = KernelSplatting(aperture, quality.name)(image, coc)
+    if quality.merging is None:
+        splat = splat_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, aperture.profile(), integrate=True)
+        want = splat[:, :3] / splat[:, 3:]
+    else:
+        want = splat_merged(image, coc, aperture.profile(), quality.merging, ones=True, normalise=True)[:, :3]
+    torch.testing.assert_close(got, want, rtol=0, atol=1e-6)
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    st.sampled_from(NAMES),
+    st.integers(1, 50),
+    st.integers(1, 50),
+    st.sampled_from([0.0, 1.0, 20.0, 300.0, 1e4]),
+    st.sampled_from(["disc", "3-gon", "6-gon"]),
+)
+def test_constant_in_constant_out(quality: str, height: int, width: int, reach: float, aperture: str) -> None:
+    seed = torch.Generator().manual_seed(height * 51 + width)
+    coc = (torch.rand(1, 1, height, width, generator=seed) * 2 - 1) * reach
+    image = torch.tensor([0.003, 0.7, 5e4]).view(1, 3, 1, 1).repeat(1, 1, height, width)
+    out = KernelSplatting(aperture, quality)(image, coc)
+    torch.testing.assert_close(out, image, rtol=2e-5, atol=0)
+
+
+@pytest.mark.parametrize("quality", NAMES)
+def test_gradients_reach_image_and_radii(quality: str) -> None:
+    image, coc = (t.requires_grad_() for t in scene())
+    KernelSplatting(quality=quality)(image, coc).square().sum().backward()
+    for leaf in (image, coc):
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all()
+        assert leaf.grad.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_dtypes(dtype: torch.dtype, quality: str) -> None:
+    image, coc = scene(h=30, w=40, reach=20)
+    out = KernelSplatting(quality=quality)(image.to(dtype), coc)
+    assert out.dtype == dtype
+    want = KernelSplatting(quality=quality)(image.to(dtype).double(), coc.double())
+    torch.testing.assert_close(out.double(), want, rtol=0, atol=1e-2 if dtype.itemsize == 2 else 1e-3)
+
+
+def test_the_plan_says_what_happens() -> None:
+    image, coc = scene(reach=60.0)
+    plan = KernelSplatting(quality="balanced").plan(image, coc)
+    assert plan.size == (60, 80)
+    assert plan.largest == pytest.approx(coc.abs().max().item())
+    assert plan.quality.name == "balanced"
+    assert plan.highest == 2  # 80 px leave room for no more
+    assert 0 < plan.predicted_error <= plan.quality.error
+    assert "blocks of up to 4 x 4 pixels" in str(plan)
+    assert not plan.sharp
+
+
+def test_what_is_sharp_passes_through() -> None:
+    image, coc = scene(reach=0.4)
+    for quality in NAMES:
+        splatting = KernelSplatting(quality=quality)
+        assert splatting.plan(image, coc).sharp
+        assert torch.equal(splatting(image, coc), image)
+        assert "passes through" in str(splatting.plan(image, coc))
+
+
+def test_small_blur_merges_nothing() -> None:
+    image, coc = scene(reach=4.0)
+    plan = KernelSplatting(quality="fast").plan(image, coc)
+    assert plan.highest == 0
+    assert plan.predicted_error == 0
+    assert "every pixel is splatted by itself" in str(plan)
+
+
+def test_a_tolerance_picks_the_quality() -> None:
+    image, coc = scene(reach=60.0)
+    assert KernelSplatting(tolerance=0.0).plan(image, coc).quality.name == "exact"
+    assert KernelSplatting(tolerance=1.0).plan(image, coc).quality.name == "fast"
+    picked = KernelSplatting(quality="fast", tolerance=0.01).plan(image, coc)
+    assert picked.predicted_error <= 0.01
+    got = KernelSplatting(tolerance=0.01)(image, coc)
+    assert torch.equal(got, KernelSplatting(quality=picked.quality.name)(image, coc))
+
+
+def test_a_plan_is_used_again() -> None:
+    image, coc = scene()
+    splatting = KernelSplatting()
+    plan = splatting.plan(image, coc)
+    assert torch.equal(splatting(image, coc, plan=plan), splatting(image, coc))
+    exact = dataclasses.replace(plan, quality=QUALITIES[0], highest=0)
+    assert torch.equal(splatting(image, coc, plan=exact), KernelSplatting(quality="exact")(image, coc))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"image": None}, TypeError, "image: expected a tensor of shape"),
+        ({"image": torch.rand(3, 60, 80)}, ValueError, "image: expected shape"),
+        ({"coc": torch.rand(1, 1, 60, 81)}, ValueError, "coc: expected shape"),
+        ({"coc": torch.full((1, 1, 60, 80), math.nan)}, ValueError, "coc: expected finite radii, got 4800"),
+        ({"plan": "balanced"}, TypeError, "plan: expected a SplattingPlan, got str"),
+        (
+            {"plan": SplattingPlan((1, 2), 1.0, QUALITIES[0], 0, 0.0, False)},
+            ValueError,
+            "plan: expected one for size",
+        ),
+    ],
+)
+def test_what_is_refused(change: dict[str, Any], error: type[Exception], message: str) -> None:
+    image, coc = scene()
+    arguments = {"image": image, "coc": coc, **change}
+    with pytest.raises(error, match=message):
+        KernelSplatting()(**arguments)
+
+
+def test_empty_pictures() -> None:
+    assert KernelSplatting()(torch.rand(0, 3, 4, 5), torch.rand(0, 1, 4, 5)).shape == (0, 3, 4, 5)
+    assert KernelSplatting()(torch.rand(1, 3, 0, 5), torch.rand(1, 1, 0, 5)).shape == (1, 3, 0, 5)
+
+
+def test_repr_and_examples() -> None:
+    assert "quality='fast'" in repr(KernelSplatting(quality="fast"))
+    assert "tolerance=0.01" in repr(KernelSplatting(tolerance=0.01))
+    assert doctest.testmod(torchbokeh.kernel_splatting).failed == 0
