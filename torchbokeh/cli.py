@@ -1,4 +1,4 @@
-"""Command line: ``torchbokeh render``, ``demo`` and ``dataset``, also as ``python -m torchbokeh``."""
+"""Command line: ``torchbokeh render``, ``demo``, ``dataset`` and ``report``, also as ``python -m torchbokeh``."""
 
 import argparse
 import math
@@ -18,6 +18,8 @@ from torchbokeh.cli_dataset import add_dataset
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.quality import QUALITIES
+from torchbokeh.report.command import add_report
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "": 1.0}
 _THIN_LENS_FLAGS = ("focus", "f_number", "focal_length", "sensor_width", "depth_scale")
@@ -70,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
     demo.set_defaults(run=_demo)
     add_dataset(commands.add_parser("dataset", help="write scenes with ground truth to train on", allow_abbrev=False))
+    add_report(commands.add_parser("report", help="measure error against run time here", allow_abbrev=False))
     return parser
 
 
@@ -99,6 +102,10 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     )
     add("--max-coc", type=_positive, metavar="PX", help="limit the blur radius (default: no limit)")
     add("--layers", type=_layers, default="auto", metavar="N", help="depth layers (default auto)")
+    grade = render.add_mutually_exclusive_group()
+    names = [quality.name for quality in QUALITIES]
+    grade.add_argument("--quality", choices=names, default="exact", help="default exact; the others are faster")
+    grade.add_argument("--tolerance", type=_positive, metavar="E", help="the fastest quality to this relative error")
     add("--exposure", type=_stops, default=0.0, metavar="STOPS", help="brighten the result (default 0)")
     add("--device", choices=("cpu", "cuda"), default="cpu")
     add("--threads", type=_count, metavar="N", help="CPU threads (default: PyTorch's choice)")
@@ -115,7 +122,8 @@ def _render(args: argparse.Namespace) -> None:
     image = read_image(args.image)
     depth = _read_depth(args, image)
     lens = _lens(args, depth).to(args.device)
-    blur = torchbokeh.LensBlur(lens, aperture=args.aperture, layers=args.layers, max_coc=args.max_coc)
+    grade = {"quality": args.quality, "tolerance": args.tolerance}
+    blur = torchbokeh.LensBlur(lens, aperture=args.aperture, layers=args.layers, max_coc=args.max_coc, **grade)
     image, depth = image.to(args.device), depth.to(args.device)
     with torch.no_grad():
         start = time.perf_counter()

@@ -220,7 +220,8 @@ def foreground_over_rest(
     for n in range(len(image)):
         scene = image[n].numpy(), coc[n, 0].numpy()
         front, known, means = kernels.split(*scene, *FOREGROUND)
-        share, total_coc, *blocks, totals = torch.from_numpy(means)[None].split([1, 1, 1, 1, image.shape[1]], 1)
+        parts = torch.from_numpy(means)[None].split([1, 1, 1, 1, image.shape[1]], 1)
+        share, total_coc, here, total_here, totals = parts
         known_share = share.clamp_min(TINY)
         hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
         rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
@@ -228,7 +229,7 @@ def foreground_over_rest(
         behind, density = blur_surface(picture, None, radius, centres[1], profile, merging, highest)
         alpha = torch.from_numpy(front)[None, None]
         colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], centres[0], profile, merging, highest)
-        half = half_density(*blocks, profile, merging, highest)
+        half = half_density(here, total_here, profile, merging, highest)
         planes = (t.contiguous().numpy() for t in (half[0, 0], behind[0], density[0, 0]))
         kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
         out[n] = behind[0]
