@@ -1,0 +1,56 @@
+import re
+
+import pytest
+
+from torchbokeh.report.tables import markdown, seconds, table
+
+
+def test_a_table_is_markdown():
+    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(123.4, "123.4"), (9.876, "9.88"), (0.5, "0.500"), (0.001234, "0.00123"), (1e-5, "1.00e-05")]
+)
+def test_seconds_have_three_digits(value, text):
+    assert seconds(value) == text
+
+
+def test_a_report_has_every_section_and_whole_tables(report):
+    text = markdown(report, ["radius.png", "truth.png", "one_layer_4.png"])
+    sections = [s for s in re.findall("^## (.*)$", text, re.MULTILINE) if s != "Share of each stage"]
+    assert sections == [
+        "Error against run time",
+        "LensBlur against the truth",
+        "Run time against radius",
+        "Run time and memory against pixels",
+        "Run time against layers",
+        "Run time against threads",
+        "What a plan leaves out",
+        "What the methods are",
+    ]
+    for picture in ("radius.png", "truth.png", "one_layer_4.png"):
+        assert text.count(f"]({picture})") == 1
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1, block
+    assert str(report["machine"]["processor"]) in text
+    assert "nan" not in text.lower().replace("dominant", "")
+
+
+def test_what_was_left_out_is_said(report):
+    text = markdown(report, [])
+    assert "takes one blur radius for the whole picture" in text
+    for line in report["absent"]:
+        assert line in text
+
+
+def test_an_experiment_without_rows_has_no_section(report):
+    short = {**report, "experiments": {name: [] for name in report["experiments"]}}
+    text = markdown(short, [])
+    assert re.findall("^## (.*)$", text, re.MULTILINE) == ["What the methods are"]
+
+
+def test_stages_are_shown_where_there_are_any(report):
+    row = {"quality": "exact", "radius": 25.0, "stage": "splat", "seconds": 0.1, "share": 0.8, "least_seconds": None}
+    found = {**report, "experiments": {**report["experiments"], "stages": [row]}}
+    assert "| exact | 25 | splat | 0.100 | 80% | - |" in markdown(found, [])

@@ -1,0 +1,152 @@
+"""Run times and errors, and which points of a plot are worth having."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Work = Callable[[], Tensor]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of several runs of one thing.
+
+    Attributes:
+        seconds: of each run, in order.
+        result: of the first run.
+    """
+
+    seconds: tuple[float, ...]
+    result: Tensor
+
+    @property
+    def row(self) -> dict[str, float | int]:
+        """Median, quartiles, fastest and slowest run in seconds, and the number of runs, for a table."""
+        ordered = np.array(self.seconds)
+        low, high = np.quantile(ordered, [0.25, 0.75])
+        return {
+            "seconds": statistics.median(self.seconds),
+            "quartile_low": float(low),
+            "quartile_high": float(high),
+            "fastest": min(self.seconds),
+            "slowest": max(self.seconds),
+            "runs": len(self.seconds),
+        }
+
+
+def measure(works: Mapping[str, Work], repeat: int, budget: float = math.inf) -> dict[str, Timing]:
+    """Time several things by turns, so that what disturbs the machine for a while disturbs them all.
+
+    Each runs once to warm up. Where that takes more than half the budget it is the one timed run.
+
+    Args:
+        works: what to time, by name.
+        repeat: timed runs of each.
+        budget: seconds for the timed runs of each; at least one is made.
+
+    Returns:
+        The timings, by name.
+
+    Example:
+        >>> measure({"sum": torch.ones(8).sum}, repeat=3)["sum"].row["runs"]
+        3
+    """
+    seconds: dict[str, list[float]] = {}
+    results: dict[str, Tensor] = {}
+    with torch.inference_mode():
+        for name, work in works.items():
+            start = time.perf_counter()
+            results[name] = work()
+            first = time.perf_counter() - start
+            seconds[name] = [first] if first > budget / 2 else []
+        for _ in range(repeat):
+            for name, work in works.items():
+                if seconds[name] and sum(seconds[name]) + max(seconds[name]) > budget:
+                    continue
+                start = time.perf_counter()
+                work()
+                seconds[name].append(time.perf_counter() - start)
+    return {name: Timing(tuple(seconds[name]), results[name]) for name in works}
+
+
+def displayed(image: Tensor) -> np.ndarray:
+    """``(1, 3+, H, W)`` linear -> ``(H, W, 3)``, as the errors see it: ``clip(x, 0, 1) ** (1/2.2)``."""
+    return (image[0, :3].double().clamp(0, 1) ** (1 / 2.2)).permute(1, 2, 0).numpy().astype(np.float32)
+
+
+def errors(image: Tensor, reference: Tensor, border: int = 0, *, flip: bool = True) -> dict[str, float | None]:
+    """How far a picture is from its reference.
+
+    Args:
+        image: ``(1, 3, H, W)``, linear.
+        reference: the same shape.
+        border: pixels to leave out at every side.
+        flip: take FLIP as well, which needs the package flip-evaluator.
+
+    Returns:
+        ``ssim`` and ``psnr`` in dB (None for equal pictures) on `displayed` values; ``l1``, the sum of absolute
+        differences of linear values over the sum of the reference; ``flip``, its mean on displayed values, or None.
+
+    Raises:
+        ValueError: nothing is left inside the border, or the shapes differ.
+
+    Example:
+        >>> picture = torch.rand(1, 3, 16, 16)
+        >>> errors(picture, picture)["l1"]
+        0.0
+    """
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    if image.shape != reference.shape:
+        raise ValueError(f"image: expected the shape {tuple(reference.shape)}, got {tuple(image.shape)}")
+    height, width = image.shape[2:]
+    if 2 * border + 7 > min(height, width):
+        raise ValueError(f"border: expected to leave at least 7 of {width} x {height} pixels, got {border}")
+    inside = (..., slice(border, height - border), slice(border, width - border))
+    image, reference = image[inside].double(), reference[inside].double()
+    shown, wanted = displayed(image), displayed(reference)
+    equal = np.array_equal(shown, wanted)
+    return {
+        "ssim": float(structural_similarity(wanted, shown, channel_axis=2, data_range=1.0)),
+        "psnr": None if equal else float(peak_signal_noise_ratio(wanted, shown, data_range=1.0)),
+        "l1": float((image - reference).abs().sum() / reference.abs().sum().clamp_min(1e-30)),
+        "flip": _flip(wanted, shown) if flip and flip_is_there() else None,
+    }
+
+
+def flip_is_there() -> bool:
+    """Whether the package flip-evaluator is installed."""
+    return find_spec("flip_evaluator") is not None
+
+
+def _flip(wanted: np.ndarray, shown: np.ndarray) -> float:
+    import flip_evaluator
+
+    return float(flip_evaluator.evaluate(wanted, shown, "LDR", applyMagma=False)[1])
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """The points that no other point beats in both coordinates; small is good.
+
+    Args:
+        points: pairs such as (seconds, error).
+
+    Returns:
+        Their indices, by the first coordinate. Of equal points the first stays.
+
+    Example:
+        >>> pareto_front([(1.0, 3.0), (2.0, 1.0), (3.0, 2.0)])
+        [0, 1]
+    """
+    front: list[int] = []
+    for k in sorted(range(len(points)), key=lambda i: (*points[i], i)):
+        if not front or points[k][1] < points[front[-1]][1]:
+            front.append(k)
+    return front

@@ -1,0 +1,68 @@
+"""All experiments, one after the other, and everything that a reader of their numbers wants to know."""
+
+import time
+from typing import Any
+
+from torchbokeh.report.baselines import absent
+from torchbokeh.report.experiments import (
+    Say,
+    against_pixels,
+    against_radius,
+    against_threads,
+    methods,
+    one_layer,
+)
+from torchbokeh.report.experiments_blur import against_layers, against_truth, left_out
+from torchbokeh.report.experiments_stages import stages
+from torchbokeh.report.machine import machine
+from torchbokeh.report.measure import flip_is_there
+from torchbokeh.report.memory import is_known
+from torchbokeh.report.settings import Settings
+
+FORMAT = 1
+"""Of ``report.json``; it goes up when the meaning of a field changes."""
+
+EXPERIMENTS = {
+    "one_layer": one_layer,
+    "truth": against_truth,
+    "radius": against_radius,
+    "pixels": against_pixels,
+    "layers": against_layers,
+    "threads": against_threads,
+    "left_out": left_out,
+    "stages": stages,
+}
+
+
+def run_experiments(settings: Settings, say: Say) -> dict[str, Any]:
+    """Run everything.
+
+    Args:
+        settings: sizes and repetitions.
+        say: is told in a line what comes next.
+
+    Returns:
+        What goes into ``report.json``: ``format``, ``machine``, ``settings``, ``methods`` with their descriptions,
+        ``absent`` with what could not be measured here and why, ``experiments`` with the rows of each, and
+        ``seconds``, how long it all took.
+    """
+    start = time.perf_counter()
+    rows = {name: experiment(settings, say) for name, experiment in EXPERIMENTS.items()}
+    return {
+        "format": FORMAT,
+        "machine": machine(),
+        "settings": settings.row(),
+        "methods": [{"name": m.name, "family": m.family, "description": m.description} for m in methods().values()],
+        "absent": _absent(),
+        "experiments": rows,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _absent() -> list[str]:
+    lines = absent()
+    if not flip_is_there():
+        lines.append("FLIP: flip-evaluator is not installed (`pip install torchbokeh[report]`)")
+    if not is_known():
+        lines.append("peak memory: only Linux tells it")
+    return lines
