@@ -18,6 +18,7 @@ PICTURES = {  # name, size, frames
     "quickstart.py": ("new/a.png", (74, 50), 1),
     "focus_pull.py": ("new/a.gif", (74, 50), 4),
     "scenes.py": ("new/a.png", (128, 192), 1),
+    "operating_points.py": ("new/a.png", (148, 100), 1),
 }
 
 

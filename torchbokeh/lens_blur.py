@@ -181,16 +181,11 @@ class LensBlur(nn.Module):
         else:
             pieces = quality.subapertures[hidden in ("given", "layers")]
         merging = quality.merging
-        highest = 0 if merging is None else highest_level(largest, size, self._finer(merging, pieces))
+        highest = 0 if merging is None else highest_level(largest, size, merging)
         sharp = largest <= MIN_RADIUS and hidden != "layers"
         error = error if highest else 0.0
         aperture = repr(self.aperture)
         return Plan(size, span, clamped, sharp, count, *kept, hidden, bins, pieces, aperture, quality, highest, error)
-
-    @staticmethod
-    def _finer(merging: Merging, pieces: int) -> Merging:
-        """A piece of the lens has PSFs that are smaller by the number of pieces each way."""
-        return merging._replace(cells=merging.cells * pieces)
 
     def forward(
         self,
@@ -232,8 +227,6 @@ class LensBlur(nn.Module):
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
             merging = plan.quality.merging
-            if merging is not None:
-                merging = self._finer(merging, plan.subapertures)
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             if image.dim() == 5:
 
