@@ -7,6 +7,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
+_FOUND = importlib.util.find_spec("numba") is not None
+
 
 @cache
 def numba_is_there() -> bool:
@@ -23,7 +25,9 @@ def numba_is_there() -> bool:
 
 def has_kernel(values: Tensor) -> bool:
     """Whether the numba kernels take these values: float32 on the CPU, and numba is installed."""
-    return values.device.type == "cpu" and values.dtype == torch.float32 and numba_is_there()
+    if values.device.type != "cpu" or values.dtype != torch.float32:
+        return False
+    return _FOUND if torch.compiler.is_compiling() else numba_is_there()  # the compiler does not follow a cache
 
 
 def compute_dtype(*tensors: Tensor) -> torch.dtype:

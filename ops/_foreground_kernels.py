@@ -127,14 +127,13 @@ def rest(
 def _double(half, y, beyond, line, out):  # type: ignore[no-untyped-def]
     """Row ``y`` of ``half`` with twice as many cells, as `merge.upsample`; it starts ``beyond`` cells outside."""
     row = (y >> 1) + beyond
-    tilt = np.float32(-0.125 if y & 1 else 0.125)
-    above, here, below = half[row - 1], half[row], half[row + 1]
+    here, beside = half[row], half[row + 1 if y & 1 else row - 1]
     for x in range(len(line)):
-        line[x] = here[x] + tilt * (above[x] - below[x])
+        line[x] = np.float32(0.75) * here[x] + np.float32(0.25) * beside[x]
     before, middle, after = line[beyond - 1 :], line[beyond:], line[beyond + 1 :]
     for x in range(len(out) >> 1):
-        d = np.float32(0.125) * (before[x] - after[x])
-        out[2 * x], out[2 * x + 1] = middle[x] + d, middle[x] - d
+        out[2 * x] = np.float32(0.75) * middle[x] + np.float32(0.25) * before[x]
+        out[2 * x + 1] = np.float32(0.75) * middle[x] + np.float32(0.25) * after[x]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

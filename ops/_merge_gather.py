@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops._merge_collect import RECORD, Lanes, Levels, bands, classify, collect
-from torchbokeh.ops._merge_kernels import bank_of, planes_of
+from torchbokeh.ops._merge_kernels import bank_of, cell_radius, planes_of
 from torchbokeh.ops._psf_bank import Bank, draw_psf, draw_slopes
 from torchbokeh.ops._rows import gather_rows
 from torchbokeh.ops._span_kernels import shape_tables
@@ -69,46 +69,37 @@ def _sum_back(lanes, pad, sums, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _across(fine, y, margin, differences):  # type: ignore[no-untyped-def]
-    """Row ``y`` of ``fine`` (counted within the picture) to cells along x, 0 outside; ``differences (w, 4)``."""
-    differences[:] = 0.0
+def _across(fine, y, margin, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of ``fine`` (counted within the picture) to cells along x, ``out (w, 4)``; 0 outside."""
+    out[:] = 0.0
     width = fine.shape[1]
     if y < -margin or y >= fine.shape[0] - margin:
         return
     row = fine[y + margin]
-    cells = differences.shape[0]
+    cells = out.shape[0]
     for i in range(cells):
         x = 2 * (i - MARGIN) + margin
         for side in range(2):
             if 0 <= x + side < width:
+                beside = i + 1 if side else i - 1
                 for k in range(4):
                     v = row[x + side, k]
-                    tilt = np.float32(0.125) * v if side == 0 else np.float32(-0.125) * v
-                    differences[i, k] += v
-                    if i > 0:
-                        differences[i - 1, k] += tilt
-                    if i < cells - 1:
-                        differences[i + 1, k] -= tilt
+                    out[i, k] += np.float32(0.75) * v
+                    if 0 <= beside < cells:
+                        out[beside, k] += np.float32(0.25) * v
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _down(fine, margin, coarse, y0, y1):  # type: ignore[no-untyped-def]
     """Rows ``y0 .. y1-1`` of the transpose of ``upsample / 4``: ``fine`` with its margin to ``coarse``."""
     width = coarse.shape[1]
-    upper, lower = np.empty((width, 4), np.float32), np.empty((width, 4), np.float32)
-    # Sum and difference of the two rows of a cell, of the cells above, at and below the current one.
-    total = np.empty((width, 4), np.float32)
-    before, here, after = np.zeros((width, 4), np.float32), np.zeros((width, 4), np.float32), np.empty_like(total)
-    for y in range(y0 - 2, y1):
-        row = 2 * (y + 1 - MARGIN)
-        _across(fine, row, margin, upper)
-        _across(fine, row + 1, margin, lower)
-        after[:] = upper - lower
-        if y >= y0:
-            coarse[y] = np.float32(0.25) * (total + np.float32(0.125) * (after - before))
-        total[:] = upper + lower
-        before[:] = here
-        here[:] = after
+    row = np.empty((width, 4), np.float32)
+    for y in range(y0, y1):
+        coarse[y] = 0.0
+        first = 2 * (y - MARGIN)
+        for k, share in ((-1, 0.25), (0, 0.75), (1, 0.75), (2, 0.25)):
+            _across(fine, first + k, margin, row)
+            coarse[y] += np.float32(0.25 * share) * row
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -142,7 +133,8 @@ def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads,
             p = RECORD * (j * across + i)
             if cells[p + 4] == 0.0:
                 continue
-            radius = np.rint(bank_steps * scale * (cells[p + 5] / cells[p + 4]))
+            smaller = cell_radius(cells, p, scale)
+            radius = np.rint(bank_steps * smaller)
             if radius < in_bank:
                 k = int(radius)
                 if cells[p + 6] < 0.0:
@@ -159,7 +151,8 @@ def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads,
             for k in range(4):
                 grads[p + k] = found[k]
                 slope += found[4 + k] * cells[p + k]
-            grads[p + 4] = slope * scale / cells[p + 4]
+            # By the mean radius, which is larger, and by each unit of its sum.
+            grads[p + 4] = slope * (scale * (cells[p + 5] / cells[p + 4]) / smaller) * scale / cells[p + 4]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

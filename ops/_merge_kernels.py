@@ -24,7 +24,7 @@ from torchbokeh.ops._rows import draw_rows, running_sum
 from torchbokeh.ops._span_kernels import shape_tables
 from torchbokeh.ops._threads import run_all, stage
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import FADE, MARGIN, STEPS, Merging
+from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, STEPS, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 
 
@@ -48,19 +48,25 @@ def coarser(coarse, y, margin, line, fine):  # type: ignore[no-untyped-def]
     ``fine`` starts ``margin`` columns left of the picture.
     """
     row = (y >> 1) + MARGIN
-    quarter = np.float32(0.25)
-    tilt = np.float32(-0.03125 if y & 1 else 0.03125)
-    above, here, below = coarse[row - 1].reshape(-1), coarse[row].reshape(-1), coarse[row + 1].reshape(-1)
+    here, beside = coarse[row].reshape(-1), coarse[row + 1 if y & 1 else row - 1].reshape(-1)
+    more, less = np.float32(0.75 * 0.25), np.float32(0.25 * 0.25)  # a pixel is a quarter of a cell
     for i in range(len(line)):
-        line[i] = quarter * here[i] + tilt * (above[i] - below[i])
+        line[i] = more * here[i] + less * beside[i]
     first = 4 * (MARGIN - (margin >> 1))
-    before, here, after = line[first - 4 :], line[first:], line[first + 4 :]
+    before, middle, after = line[first - 4 :], line[first:], line[first + 4 :]
+    more, less = np.float32(0.75), np.float32(0.25)
     for column in range(len(fine) >> 3):
         for k in range(4):
             i = 4 * column + k
-            d = np.float32(0.125) * (before[i] - after[i])
-            fine[2 * i - k] = here[i] + d
-            fine[2 * i - k + 4] = here[i] - d
+            fine[2 * i - k] = more * middle[i] + less * before[i]
+            fine[2 * i - k + 4] = more * middle[i] + less * after[i]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def cell_radius(cells, p, scale):  # type: ignore[no-untyped-def]
+    """Mean radius of a cell in cells of its level, less what interpolation will add."""
+    mean = scale * (cells[p + 5] / cells[p + 4])
+    return math.sqrt(max(mean * mean - SPREAD, MIN_RADIUS * MIN_RADIUS))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -83,7 +89,7 @@ def _cell_band(cells, reach, rows, level, bank, shape, coarse, out, band, y0, y1
         p = RECORD * j * across
         for i in range(across):
             if cells[p] != 0.0 or cells[p + 1] != 0.0 or cells[p + 2] != 0.0 or cells[p + 3] != 0.0:
-                radius = np.rint(bank_steps * scale * (cells[p + 5] / cells[p + 4]))
+                radius = np.rint(bank_steps * cell_radius(cells, p, scale))
                 if radius < in_bank:
                     k = int(radius)
                     if cells[p + 6] < 0.0:

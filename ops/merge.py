@@ -8,8 +8,9 @@ the cheaper, and without an upper bound of the radius.
 
 Where the error comes from, and what is done about it:
 
-* *Interpolation.* Bilinear interpolation blurs once more. A level holds means over its cells, so they are cut into
-  the means of four smaller cells by a parabola through three of them (`upsample`): exact for quadratic pictures.
+* *Interpolation.* Bilinear interpolation blurs once more. Cells are splatted with a radius that is smaller by just as
+  much (`SPREAD`). Higher orders would be more exact, but their negative lobes are larger than what covers a picture
+  thinly beside a dense part: a halo after the division by coverage.
 * *Level borders.* Between the radii of two levels a pixel shares itself between both: no seam, no popping.
 * *Highlights.* What is so bright that the edge of its PSF can be seen stays on the lowest level, whatever its radius.
 * *Mixed radii.* A cell only holds pixels of one level, so their radii differ by little more than a factor of two, and
@@ -31,7 +32,7 @@ from torch.nn import functional as F
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.spans import Profile, working_dtype
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
 FADE = 0.125
@@ -42,6 +43,9 @@ STEPS = 64
 
 MARGIN = 2
 """Cells around the picture of a level: interpolation at the border looks beyond it."""
+
+SPREAD = 2 / 3
+"""What interpolation adds to the square of a radius in cells: 4 times its variance, 1/8 + 1/32 + ... = 1/6."""
 
 FEWEST = 16
 """Cells across the longer side of the coarsest level. From there on, the height of the picture bounds the cost."""
@@ -117,25 +121,28 @@ def merge_cells(
 
         counted = share if weight is None else share * weight.detach()
         radius = total(counted * coc.abs()) / total(counted).clamp_min(TINY) / size
+        if level:
+            radius = (radius.square() - SPREAD).clamp_min(MIN_RADIUS**2).sqrt()
         rounded = (radius.detach() * STEPS).round() / STEPS
         radius = radius + (rounded - radius.detach())
-        weighted = values * share if weight is None else values * (share * weight)
-        levels.append((total(weighted), torch.where(total(counted * coc.detach()) < 0, -radius, radius)))
+        factor = share if weight is None else share * torch.where(weight > 0, weight, 0.0)
+        # What is infinite stays on its own levels.
+        levels.append(
+            (
+                total(torch.where(factor > 0, values * factor, 0.0)),
+                torch.where(total(counted * coc.detach()) < 0, -radius, radius),
+            )
+        )
     return levels
 
 
 def upsample(coarse: Tensor) -> Tensor:
-    """Twice as many cells each way, ``(B, C, h, w) -> (B, C, 2h, 2w)``: means over cells to means over their quarters.
-
-    A parabola that has the means of three neighbouring cells has the means ``b ± (a - c) / 8`` over the halves of the
-    middle one: the total is kept, and quadratic pictures are met exactly.
-    """
+    """Twice as many cells each way, ``(B, C, h, w) -> (B, C, 2h, 2w)``: bilinear, so never negative."""
     for dim in (2, 3):
         n = coarse.shape[dim]
         before = torch.cat([coarse.narrow(dim, 0, 1), coarse.narrow(dim, 0, n - 1)], dim)
         after = torch.cat([coarse.narrow(dim, 1, n - 1), coarse.narrow(dim, n - 1, 1)], dim)
-        tilt = (before - after) / 8
-        coarse = torch.stack([coarse + tilt, coarse - tilt], dim + 1).flatten(dim, dim + 1)
+        coarse = torch.stack([torch.lerp(coarse, t, 0.25) for t in (before, after)], dim + 1).flatten(dim, dim + 1)
     return coarse
 
 
@@ -223,11 +230,14 @@ def splat_merged(
         check_image("weight", weight, (b, 1, h, w), like=values)
     if highest is None:
         highest = highest_level(float(coc.detach().abs().max()) if coc.numel() else 0.0, (h, w), merging)
+    if values.shape[1] + ones == 0 or coc.numel() == 0:
+        nothing = values * coc
+        return torch.cat([nothing, coc], 1) if ones else nothing
     dtype = compute_dtype(values, coc)
     source, radius = values.to(dtype), coc.to(dtype)
     weight = None if weight is None else weight.to(dtype)
     fixed = not (profile.knots.requires_grad or profile.bulge.requires_grad)
-    if has_kernel(source) and fixed and source.numel():
+    if has_kernel(source) and fixed:
         knots, bulge = profile.knots.double(), profile.bulge.double()
         out = _splat_merged_op(source, radius, weight, knots, bulge, *merging, highest, ones, normalise)
     else:
