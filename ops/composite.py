@@ -95,13 +95,13 @@ def bin_weights(coc: Tensor, centres: Sequence[float], blend: float = 1.0) -> li
     """
     if len(centres) == 1:
         return [torch.ones_like(coc)]
-    place = (coc - centres[0]) / (centres[1] - centres[0])
-    # The outer bins lie at the smallest and the largest CoC of the scene and move with what has them, the sky say:
-    # its shares do not change, so no gradient runs through them.
-    half = 0.5 * (len(centres) - 1)
-    if place.requires_grad:
-        inside = (place - half).abs() < half - 1e-4
-        place = torch.where(inside, place, place.detach().clamp(0, 2 * half))
+    spacing, last = centres[1] - centres[0], len(centres) - 1
+    if coc.requires_grad:
+        # The outer bins lie at the smallest and the largest CoC of the scene and move with what has them, the sky say:
+        # its shares do not change, so no gradient runs through them.
+        place = (coc - centres[0]) / spacing
+        coc = torch.where((place - 0.5 * last).abs() < 0.5 * last - 1e-4, coc, coc.detach())
     # What has passed on beyond each bin.
-    beyond = [((place - (k + 0.5)) / blend + 0.5).clamp_(0, 1) for k in range(len(centres) - 1)]
+    slope = 1 / (spacing * blend)
+    beyond = [coc.mul(slope).add_(0.5 - slope * (centres[0] + (k + 0.5) * spacing)).clamp_(0, 1) for k in range(last)]
     return [1 - beyond[0], *(a - b for a, b in pairwise(beyond)), beyond[-1]]

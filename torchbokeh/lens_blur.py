@@ -126,7 +126,8 @@ class LensBlur(nn.Module):
             hidden: Hidden = "nothing"
             bins: tuple[tuple[float, ...], ...]
             if in_front:
-                bins = bin_centres(low, stop, most), bin_centres(start, high, most)
+                ahead = self.layers or (1 if quality.coarse else quality.bins)
+                bins = bin_centres(low, stop, ahead), bin_centres(start, high, most)
                 hidden = "filled" if background is None else "given"
             else:
                 bins = (bin_centres(low, high, most),)

@@ -19,7 +19,7 @@ class Quality(NamedTuple):
             from 12 to 80 px. `torchbokeh report` measures it anew.
         bins: most soft bins of a surface in a composition.
         subapertures: most pieces of the lens each way where hidden content is guessed, and where it is known.
-        coarse: hidden content is filled in blocks of pixels.
+        coarse: hidden content is filled in blocks of pixels, and the foreground of a plain image is one bin.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Quality(NamedTuple):
 QUALITIES = (
     Quality("exact", None, 0.0, 8, (2, 3), False),
     Quality("high", Merging(8.0, 0.005), 0.005, 8, (2, 3), False),
-    Quality("balanced", Merging(4.0, 0.015), 0.016, 3, (1, 2), True),
+    Quality("balanced", Merging(4.0, 0.015), 0.016, 2, (1, 2), True),
     Quality("fast", Merging(2.5, 0.03), 0.03, 2, (1, 1), True),
 )
 """All operating points, from the most exact to the fastest."""
