@@ -79,8 +79,9 @@ def _draw_all(count, steps, shapes, s, bulge, inv_area, with_slopes):  # type: i
     ends, firsts = np.zeros(count + 1, np.int64), np.zeros(count, np.int64)
     for k in range(count):
         r = max(k / steps, MIN_RADIUS)
-        firsts[k] = math.ceil(r * shapes[s, 0, 0] - 0.5)
-        ends[k + 1] = ends[k] + math.floor(r * shapes[s, -1, 0] + 0.5) - firsts[k] + 1
+        # A row that is only touched holds nothing: a PSF of half a pixel is one row.
+        firsts[k] = math.ceil(r * shapes[s, 0, 0] - 0.5 + 1e-9)
+        ends[k + 1] = ends[k] + math.floor(r * shapes[s, -1, 0] + 0.5 - 1e-9) - firsts[k] + 1
     columns, weights = np.empty((ends[-1], 2), np.int64), np.empty((ends[-1], 4), np.float64)
     slopes = np.zeros((ends[-1] if with_slopes else 0, 4), np.float64)
     most = int(2 * count / steps) + 8

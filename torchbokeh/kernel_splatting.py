@@ -76,7 +76,7 @@ class KernelSplatting(nn.Module):
         torch.Size([1, 3, 64, 64])
         >>> print(splatting.plan(image, coc))
         64 x 64 image, radius up to 20.0 px.
-        Quality 'balanced': blocks of up to 4 x 4 pixels are merged; predicted relative error 0.016.
+        Quality 'balanced': blocks of up to 4 x 4 pixels are merged; predicted relative error 0.019.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class KernelSplatting(nn.Module):
         largest, *shares = torch.stack([radius.amax(), *merged_shares(radius, self.quality, self.tolerance)]).tolist()
         quality, error = choose(self.quality, self.tolerance, shares)
         highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
-        return SplattingPlan(size, largest, quality, highest, error if highest else 0.0, largest <= MIN_RADIUS)
+        return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS)
 
     def forward(self, image: Tensor, coc: Tensor, *, plan: SplattingPlan | None = None) -> Tensor:
         """Blur a picture.

@@ -184,7 +184,6 @@ class LensBlur(nn.Module):
         merging = quality.merging
         highest = 0 if merging is None else highest_level(largest, size, merging)
         sharp = largest <= MIN_RADIUS and hidden != "layers"
-        error = error if highest else 0.0
         aperture = repr(self.aperture)
         return Plan(size, span, clamped, sharp, count, *kept, hidden, bins, pieces, aperture, quality, highest, error)
 

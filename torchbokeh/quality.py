@@ -32,11 +32,15 @@ class Quality(NamedTuple):
 
 QUALITIES = (
     Quality("exact", None, 0.0, 8, (2, 3), False),
-    Quality("high", Merging(8.0, 0.005), 0.005, 8, (2, 3), False),
-    Quality("balanced", Merging(4.0, 0.015), 0.016, 2, (1, 2), True),
-    Quality("fast", Merging(2.5, 0.03), 0.03, 2, (1, 1), True),
+    Quality("high", Merging(8.0, 0.005), 0.006, 8, (2, 3), False),
+    Quality("balanced", Merging(4.0, 0.015), 0.019, 2, (1, 2), True),
+    Quality("fast", Merging(2.5, 0.03), 0.033, 2, (1, 1), True),
 )
 """All operating points, from the most exact to the fastest."""
+
+
+ROUNDING = 5e-4
+"""Relative L1 error where nothing is merged: radii are rounded to 1/64 px."""
 
 
 def check_quality(quality: object, tolerance: object) -> None:
@@ -73,9 +77,11 @@ def choose(quality: str, tolerance: float | None, shares: Sequence[float]) -> tu
     Args:
         quality: the name of one, taken where ``tolerance`` is None.
         tolerance: the largest predicted error; the fastest point that keeps to it is taken.
-        shares: those of `merged_shares`: what is not merged has no error.
+        shares: those of `merged_shares`: what is not merged has no error but that of `ROUNDING`.
     """
-    predicted = [q.error * share for q, share in zip(QUALITIES, shares, strict=True)]
+    predicted = [
+        0.0 if q.merging is None else max(q.error * share, ROUNDING) for q, share in zip(QUALITIES, shares, strict=True)
+    ]
     if tolerance is None:
         k = [q.name for q in QUALITIES].index(quality)
     else:

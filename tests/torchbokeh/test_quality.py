@@ -9,7 +9,7 @@ from torch import Tensor
 import torchbokeh as tb
 from torchbokeh.ops.merge import splat_merged
 from torchbokeh.ops.splat import splat_spans
-from torchbokeh.quality import QUALITIES, check_quality, choose, merged_shares
+from torchbokeh.quality import QUALITIES, ROUNDING, check_quality, choose, merged_shares
 
 MERGED = [q for q in QUALITIES if q.merging is not None]
 
@@ -57,7 +57,8 @@ def test_a_tolerance_takes_the_fastest_point_that_keeps_to_it() -> None:
     assert choose("exact", 1.0, everything)[0].name == "fast"
     # Where little is wide enough to be merged, little is wrong.
     assert choose("exact", 0.001, [0.0, 0.01, 0.02, 0.03])[0].name == "fast"
-    assert choose("exact", 0.0, [0.0, 0.0, 0.0, 0.0])[0].name == "fast"
+    assert choose("exact", ROUNDING, [0.0, 0.0, 0.0, 0.0])[0].name == "fast"
+    assert choose("exact", 0.9 * ROUNDING, [0.0, 0.0, 0.0, 0.0])[0].name == "exact"
     assert choose("balanced", None, everything)[0].name == "balanced"
 
 

@@ -4,15 +4,15 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
-from importlib import import_module
-from importlib.util import find_spec
 
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._dispatch import numba_is_there
+from torchbokeh.ops._threads import recorded
 from torchbokeh.report.experiments import Row, Say
 from torchbokeh.report.methods import QUALITIES, own_methods, own_name
+from torchbokeh.report.roofline import least_seconds, measured_rates
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
 
@@ -27,20 +27,23 @@ def stages(settings: Settings, say: Say) -> list[Row]:
 
     Returns:
         Rows with ``quality``, ``radius``, ``stage``, ``seconds`` (median), ``share`` of the whole, and
-        ``least_seconds``, a lower bound by what has to be read, written and computed; None where none is known.
-        Nothing where the recorder of stages is not there.
+        ``least_seconds``, a lower bound by what has to be read, written and drawn (see `roofline`); None where none is
+        known. Nothing without numba, whose kernels record their stages.
     """
-    recorded = recorder()
-    if recorded is None:
+    if not numba_is_there():
         return []
+    rates = measured_rates()
     rows: list[Row] = []
     for radius in settings.photo_radii:
         say(f"share of each stage: radius {radius:g} px")
         seen = photo(settings.photo_size, radius)
         for quality in QUALITIES:
             run = own_methods()[own_name(quality)].run
-            found = shares(partial(run, seen.image, seen.coc), recorded, settings.repeat)
-            rows += [{"quality": quality, "radius": radius, **row, "least_seconds": None} for row in found]
+            found = shares(lambda run=run, seen=seen: run(seen.image, seen.coc), recorded, settings.repeat)
+            least = least_seconds(seen.image, seen.coc, quality, rates)
+            rows += [
+                {"quality": quality, "radius": radius, **row, "least_seconds": least.get(row["stage"])} for row in found
+            ]
     return rows
 
 
@@ -65,10 +68,3 @@ def shares(work: Callable[[], Tensor], recorded: Recorder, repeat: int) -> list[
     names = dict.fromkeys(name for part in parts for name in part)
     medians = {name: statistics.median(part.get(name, 0.0) for part in parts) for name in names}
     return [{"stage": name, "seconds": value, "share": value / total} for name, value in medians.items()]
-
-
-def recorder() -> Recorder | None:
-    """The recorder of the stages of the operators; None where they have none."""
-    if find_spec("torchbokeh.ops._stages") is None:
-        return None
-    return import_module("torchbokeh.ops._stages").recorded

@@ -91,7 +91,7 @@ def least_seconds(image: Tensor, coc: Tensor, quality: str, rates: Rates) -> dic
     points, cells = [], 0
     for level, (values, radius) in enumerate(merge_cells(image, coc, shares)):
         alive = (values != 0).any(1, keepdim=True)
-        rows = 2 * (radius.abs().clamp_min(MIN_RADIUS) + 0.5).floor() + 1
+        rows = 2 * (radius.abs().clamp_min(MIN_RADIUS) + 0.499).floor() + 1
         points.append(2 * rows.clamp(max=values.shape[2])[alive].sum().item())
         cells += radius.numel() if level else 0
     planes = image.numel() + coc.numel()

@@ -38,15 +38,17 @@ def test_a_stage_that_is_not_always_there_counts_as_nothing():
     assert {row["stage"]: row["seconds"] for row in shares(work, sometimes, 3)}["b"] == 0
 
 
-def test_every_quality_and_radius_has_its_stages(monkeypatch, tiny):
-    monkeypatch.setattr(module, "recorder", lambda: recorded)
+def test_every_quality_and_radius_has_its_stages(tiny):
     rows = stages(tiny, lambda line: None)
     assert {(row["quality"], row["radius"]) for row in rows} == {
         (quality, radius) for quality in module.QUALITIES for radius in tiny.photo_radii
     }
     assert rows[0].keys() == {"quality", "radius", "stage", "seconds", "share", "least_seconds"}
+    bounded = [row for row in rows if row["least_seconds"] is not None]
+    assert {row["stage"] for row in bounded} >= {"mean", "collect", "picture"}
+    assert all(row["least_seconds"] > 0 for row in bounded)
 
 
-def test_without_a_recorder_there_are_none(monkeypatch, tiny):
-    monkeypatch.setattr(module, "recorder", lambda: None)
+def test_without_kernels_there_are_none(monkeypatch, tiny):
+    monkeypatch.setattr(module, "numba_is_there", lambda: False)
     assert stages(tiny, lambda line: None) == []
