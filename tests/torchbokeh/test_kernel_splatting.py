@@ -3,6 +3,9 @@
 import dataclasses
 import doctest
 import math
+import os
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -155,3 +158,46 @@ def test_repr_and_examples() -> None:
     assert "quality='fast'" in repr(KernelSplatting(quality="fast"))
     assert "tolerance=0.01" in repr(KernelSplatting(tolerance=0.01))
     assert doctest.testmod(torchbokeh.kernel_splatting).failed == 0
+
+
+MEMORY = """
+import sys
+from pathlib import Path
+import torch
+from torchbokeh import KernelSplatting
+
+def resident(key):
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines[key].split()[0]) * 1024
+
+def forget():
+    Path("/proc/self/clear_refs").write_text("5")
+    return resident("VmRSS")
+
+splatting, backward, radius = KernelSplatting(quality=sys.argv[1]), sys.argv[2] == "backward", float(sys.argv[3])
+for side in (64, 1024):  # the first compiles
+    image = torch.rand(1, 3, side, side).requires_grad_(backward)
+    coc = torch.linspace(-radius, radius, side).expand(1, 1, side, side).contiguous().requires_grad_(backward)
+    plan, grad = splatting.plan(image, coc), torch.rand(1, 3, side, side)
+    before = forget()
+    out = splatting(image, coc, plan=plan)
+    if backward:
+        before = forget()
+        out.backward(grad)
+print((resident("VmHWM") - before) / 1024**2)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="this system does not tell peak memory")
+@pytest.mark.parametrize("radius", [10.0, 100.0])
+@pytest.mark.parametrize(
+    ("quality", "way", "most"),
+    [("balanced", "forward", 45), ("balanced", "backward", 125), ("exact", "forward", 70), ("exact", "backward", 160)],
+)
+def test_memory_is_that_of_the_docstring(quality: str, way: str, most: float, radius: float) -> None:
+    command = [sys.executable, "-P", "-c", MEMORY, quality, way, str(radius)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    assert 10 < float(done.stdout) < most
