@@ -57,7 +57,7 @@ class KernelSplatting(nn.Module):
     merged by radius (`torchbokeh.ops.merge`), so that a wider blur costs less.
 
     Memory on the CPU in float32 for three channels, result included and inputs not: at most 45 MB per megapixel forward
-    and 125 MB backward where pixels are merged, 70 and 160 MB for exact quality, whatever the radius.
+    and 125 MB backward where pixels are merged, 70 and 180 MB for exact quality, whatever the radius.
 
     Args:
         aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
