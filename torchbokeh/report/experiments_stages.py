@@ -4,6 +4,7 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -39,7 +40,7 @@ def stages(settings: Settings, say: Say) -> list[Row]:
         seen = photo(settings.photo_size, radius)
         for quality in QUALITIES:
             run = own_methods()[own_name(quality)].run
-            found = shares(lambda run=run, seen=seen: run(seen.image, seen.coc), recorded, settings.repeat)
+            found = shares(partial(run, seen.image, seen.coc), recorded, settings.repeat)
             least = least_seconds(seen.image, seen.coc, quality, rates)
             rows += [
                 {"quality": quality, "radius": radius, **row, "least_seconds": least.get(row["stage"])} for row in found
