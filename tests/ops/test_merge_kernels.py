@@ -413,6 +413,17 @@ def test_highlights_are_noted_and_rows_know_their_reach() -> None:
     assert collected(values.clamp_max(1), torch.full_like(coc, 12.0), 1).reach[0].max() < 0
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_mean_is_that_of_pixels_that_hold_anything(weighted: bool) -> None:
+    values, coc = scene(1, 3, 100, 70)
+    values[..., 20:90, :] = 0
+    values[:, 1] = 0
+    weight = weights(coc) if weighted else None
+    counted = (values != 0).any(1, keepdim=True) * (1.0 if weight is None else weight)
+    want = (values * counted).sum((0, 2, 3)) / counted.sum()
+    np.testing.assert_allclose(collected(values, coc, 2, weight=weight).bounds, want, rtol=1e-5)
+
+
 BYTES = {"collect": 20, "forward": 24, "backward": 80}
 """Most bytes per pixel that numpy holds at a time, for each pass of four channels; see below what they are for."""
 
