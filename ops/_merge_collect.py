@@ -246,5 +246,6 @@ def collect(
 
 
 def bands(height: int) -> list[tuple[int, int]]:
-    """Pieces of work that together make up ``height`` rows."""
-    return [(y, min(y + BAND, height)) for y in range(0, height, BAND)]
+    """Pieces of work that together make up ``height`` rows; low pictures come in eight or so, for all threads."""
+    rows = min(max(-(-height // 8), 16), BAND)
+    return [(y, min(y + rows, height)) for y in range(0, height, rows)]

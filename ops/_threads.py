@@ -1,8 +1,8 @@
 """Run independent pieces of work on as many threads as torch uses, and on request take the time of each stage."""
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,20 +37,31 @@ def stage(name: str) -> Iterator[None]:
 def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]], name: str = "other") -> None:
     """Call ``work(*piece)`` for every piece, on ``torch.get_num_threads()`` threads.
 
-    The pool lives for one call only, so nothing is left behind that a forked process could trip over; a
-    ``DataLoader`` worker has one thread and runs the pieces itself. The pieces must not depend on each other.
+    The calling thread takes part; the others live for one call only, so nothing is left behind that a forked process
+    could trip over. The pieces must not depend on each other.
 
     Args:
         work: the function.
         pieces: its arguments, one tuple for each call.
         name: the stage that the time counts for, see `recorded`.
     """
-    threads = torch.get_num_threads()
-    with stage(name):
-        if threads == 1:
-            for piece in pieces:
+    pieces = list(pieces)
+    queue = iter(pieces)  # a list's iterator gives every piece to one thread only
+    errors: list[BaseException] = []
+
+    def take() -> None:
+        try:
+            while not errors and (piece := next(queue, None)) is not None:
                 work(*piece)
-            return
-        with ThreadPoolExecutor(threads) as pool:
-            for done in [pool.submit(work, *piece) for piece in pieces]:
-                done.result()
+        except BaseException as error:
+            errors.append(error)
+
+    with stage(name):
+        helpers = [threading.Thread(target=take) for _ in range(min(torch.get_num_threads(), len(pieces)) - 1)]
+        for helper in helpers:
+            helper.start()
+        take()
+        for helper in helpers:
+            helper.join()
+    if errors:
+        raise errors[0]
