@@ -1,5 +1,6 @@
 """The pictures of a report."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -37,7 +38,7 @@ class _Label:
     y: float
     text: str
     colour: str
-    left: bool = False
+    side: tuple[int, int] = (1, 0)
 
 
 def draw(found: dict[str, Any]) -> dict[str, Figure]:
@@ -152,7 +153,7 @@ def _label(row: Row) -> _Label:
     elif row["family"].startswith("layered"):
         name = name.split(",")[0].split()[-1]
     # The line of the best goes on to the right, and comes from above.
-    return _Label(row["seconds"], _error(row["ssim"]), name, COLOURS[row["family"]], left=row["pareto"])
+    return _Label(row["seconds"], _error(row["ssim"]), name, COLOURS[row["family"]], (-1 if row["pareto"] else 1, 0))
 
 
 def _keys(rows: Iterable[Row]) -> list[Line2D]:
@@ -206,7 +207,7 @@ def _write_labels(figure: Figure, axes: Axes, labels: Sequence[_Label]) -> None:
 
 def _places(label: _Label) -> list[tuple[int, tuple[int, int]]]:
     """Distances in points and sides that a label may have, the best first."""
-    sides = sorted(_SIDES, key=lambda side: side[0]) if label.left else _SIDES
+    sides = sorted(_SIDES, key=lambda side: math.dist(side, label.side))
     return [(distance, side) for distance in (7, 13, 20) for side in sides]
 
 
@@ -225,7 +226,7 @@ def _truth(rows: list[Row]) -> Figure:
         for quality in dict.fromkeys(row["quality"] for row in chosen):
             of = [row for row in chosen if row["quality"] == quality]
             points.append((_mean([row["seconds"] for row in of]), _mean([1 - row["ssim_truth"] for row in of])))
-            labels.append(_Label(*points[-1], quality, colour))
+            labels.append(_Label(*points[-1], quality, colour, (0, 1)))
         axes.plot(*zip(*points, strict=True), "o-", color=colour, label=given, markersize=6)
     noise = _mean([1 - row["ssim_truth"] for row in rows if row["input"] == "truth"])
     axes.axhline(noise, color="0.6", linestyle="--", label="between two halves\nof the truth")
@@ -287,9 +288,9 @@ def _pixels(rows: list[Row]) -> Figure:
         _curves(grid[1], memory, "megapixels", "megabytes")
         grid[1].set(ylabel="peak memory, MB per megapixel", title="one call, beyond its inputs", yscale="linear")
         grid[1].set_ylim(bottom=0)
-    for axes in grid:
+    for axes, shown in zip(grid, (rows, [row for row in rows if row.get("peak_bytes")]), strict=False):
         axes.set_xlabel("megapixels")
-        _plain(axes, {row["megapixels"] for row in rows})
+        _plain(axes, {row["megapixels"] for row in shown})
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
     return figure
 
@@ -340,6 +341,7 @@ def _plain_seconds(axes: Axes, which: Any = None) -> None:
     axis = axes.xaxis if which is None else which
     low, high = axis.get_view_interval()
     few: Callable[[float], bool] = lambda value: f"{value:e}"[0] in ("25" if high / low < 300 else "")  # noqa: E731
+    axis.set_tick_params(which="minor", pad=5.1)  # in line with the major ones, whose ticks are longer
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if few(value) else ""))
 
