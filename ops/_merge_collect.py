@@ -208,7 +208,7 @@ def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
         for k in range(channels):
             plane, total = values[k, y], np.float32(0.0)
             for x in range(width):
-                total += abs(plane[x]) * alive[x]
+                total += abs(plane[x]) * alive[x] if alive[x] > 0.0 else np.float32(0.0)
             sums[y, k] = total
         count = np.float32(0.0)
         for x in range(width):

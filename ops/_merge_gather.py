@@ -214,7 +214,8 @@ def _gather_pixels(  # type: ignore[no-untyped-def]
             for k in range(4):
                 if channel[k] >= 0:
                     grad_values[channel[k], y, x] = whole * grad[k]
-                    by_weight += values[channel[k], y, x] * grad[k]
+                    if level != -2:
+                        by_weight += values[channel[k], y, x] * grad[k]
                 else:
                     by_weight += constant[k] * grad[k]
             if weight.shape[0] > 0:
@@ -243,8 +244,8 @@ def gather_merged(
     bank = bank_of(merging, shape, slopes=True)
     source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
     weights = planes_of(weight, b)
-    grad_values, grad_coc = torch.empty_like(source), torch.empty(b, 1, h, w)
-    grad_weight = torch.empty(b, *weights[0].shape)
+    grad_values, grad_coc = torch.empty_like(source), torch.empty(b, 1, h, w, dtype=torch.float32)
+    grad_weight = torch.empty(b, *weights[0].shape, dtype=torch.float32)
     grad_np = grad.contiguous().numpy()
     divided = np.empty((b, 0, h, w), np.float32) if out is None else out.contiguous().numpy()
     for n in range(b):

@@ -27,6 +27,9 @@ from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, STEPS, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 
+WIDEST = 32.0
+"""Radius in cells up to which PSFs are kept: their number of points grows with its square."""
+
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _draw_wide(band, stride, pad, width, src, p, x, y, coc, shapes, bulge, inv_area, y0, y1, rows, columns, weights):  # type: ignore[no-untyped-def]
@@ -134,7 +137,8 @@ def _lowest(values, coc, weight, y, channel, constant, levels, shares, bank_step
         if channel[k] >= 0:
             plane = values[channel[k], y]
             for x in range(len(plane)):
-                value = shares[x] * plane[x]
+                # What has no share may be anything, NaN as well.
+                value = shares[x] * plane[x] if shares[x] != zero else zero
                 lane[4 * x] = value
                 energy[x] += abs(value)
         else:
@@ -239,8 +243,8 @@ def _pixel_band(  # type: ignore[no-untyped-def]
 
 
 def bank_of(merging: Merging, shape: tuple[np.ndarray, float, float], *, slopes: bool = False) -> Bank:
-    """The PSFs of every cell but those that are wider than the levels would have them."""
-    return psf_bank(2.0 * merging.cells * (1 + FADE), STEPS, *shape, slopes=slopes)
+    """The PSFs of every cell but those that are wider than the levels would have them, or than `WIDEST`."""
+    return psf_bank(min(2.0 * merging.cells * (1 + FADE), WIDEST), STEPS, *shape, slopes=slopes)
 
 
 def planes_of(weight: Tensor | None, batch: int) -> list[np.ndarray]:
@@ -267,7 +271,7 @@ def splat_merged(
         bank = bank_of(merging, shape)
     source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
     weights = planes_of(weight, b)
-    out = torch.empty(b, channels + ones, h, w)
+    out = torch.empty(b, channels + ones, h, w, dtype=torch.float32)
     groups = -(-(channels + ones) // 4)
     last = channels + ones - 1 if normalise and groups == 1 else -1
     buffers: list[np.ndarray] = []

@@ -91,7 +91,7 @@ def blur_surface(
     bank = bank_of(merging, shape)
     source, radii = colour.detach().contiguous(), coc.detach().contiguous()
     planes = [planes_of(weight, b) for weight in weights]
-    mixed, total = torch.zeros(b, channels, h, w), torch.zeros(b, 1, h, w)
+    mixed, total = (torch.zeros(b, c, h, w, dtype=torch.float32) for c in (channels, 1))
     taken = np.zeros((b, h, w), np.float32)
     lanes = Lanes.of(0, channels, True)
     buffers: list[np.ndarray] = []

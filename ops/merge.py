@@ -85,7 +85,8 @@ def level_shares(
     values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
     holds = (values != 0).any(1, keepdim=True).to(values.dtype)
     counted = holds if weight is None else holds * weight.detach()
-    mean = (values.abs() * counted).sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
+    magnitude = torch.where(counted > 0, values.abs() * counted, 0.0)
+    mean = magnitude.sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
     ordinary = ~(values.abs() > mean * bound).any(1, keepdim=True)
     above = [torch.ones_like(radius)]
@@ -211,7 +212,7 @@ def splat_merged(
 
     Raises:
         TypeError: an argument is not a floating-point tensor.
-        ValueError: shapes or devices do not fit.
+        ValueError: shapes, devices or settings do not fit.
 
     Example:
         >>> import torch
@@ -228,8 +229,15 @@ def splat_merged(
     check_image("profile.bulge", profile.bulge, (), like=values)
     if weight is not None:
         check_image("weight", weight, (b, 1, h, w), like=values)
+    if not 0 < merging.cells < math.inf or not merging.highlight >= 0:
+        raise ValueError(f"merging: expected cells above 0 and a highlight of at least 0, got {merging}")
+    if highest is not None and highest < 0:
+        raise ValueError(f"highest: expected at least 0, got {highest}")
     if highest is None:
-        highest = highest_level(float(coc.detach().abs().max()) if coc.numel() else 0.0, (h, w), merging)
+        largest = float(coc.detach().abs().max()) if coc.numel() else 0.0
+        if not math.isfinite(largest):
+            raise ValueError(f"coc: expected finite radii, got one of {largest}")
+        highest = highest_level(largest, (h, w), merging)
     if values.shape[1] + ones == 0 or coc.numel() == 0:
         nothing = values * coc
         return torch.cat([nothing, coc], 1) if ones else nothing

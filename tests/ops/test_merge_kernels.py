@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchbokeh.ops import _merge_gather, _merge_kernels
 from torchbokeh.ops._merge_collect import RECORD, Lanes, Levels, collect
+from torchbokeh.ops._merge_kernels import bank_of
 from torchbokeh.ops._psf_bank import Bank, psf_bank
 from torchbokeh.ops._rows import draw_rows, gather_rows, running_sum
 from torchbokeh.ops._span_kernels import shape_tables
@@ -656,3 +657,55 @@ def test_an_error_in_a_piece_of_work_is_passed_on(threads: int) -> None:
     torch.set_num_threads(threads)
     with pytest.raises(ZeroDivisionError):
         run_all(lambda k: 1 / k, [(1,), (0,), (2,)])
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("radius", [3.0, 12.0])
+def test_what_has_no_weight_may_be_no_number(dtype: torch.dtype, radius: float) -> None:
+    values, coc = torch.rand(1, 3, 60, 60, dtype=dtype), torch.full((1, 1, 60, 60), radius, dtype=dtype)
+    weight = torch.ones_like(coc)
+    weight[..., 30, 30] = 0
+    clean = splat_merged(values, coc, Disc().profile(), MIDDLE, weight=weight, ones=True)
+    values[..., 30, 30] = math.nan
+    leaves = [t.clone().requires_grad_() for t in (coc, weight)]
+    out = splat_merged(values, leaves[0], Disc().profile(), MIDDLE, weight=leaves[1], ones=True)
+    assert torch.equal(out.detach(), clean)
+    assert all(g.isfinite().all() for g in torch.autograd.grad(out.sum(), leaves))
+
+
+def test_the_bank_stays_small_where_nothing_is_to_be_merged() -> None:
+    values, coc = scene(1, 3, 60, 50, 40.0)
+    huge = MIDDLE._replace(cells=1000.0)
+    bank = bank_of(huge, shape_tables(Disc().profile()), slopes=True)
+    assert sum(t.nbytes for t in bank[3:]) < 2**25
+    got, want = (
+        splat_merged(v, c, Disc().profile(), huge) for v, c in ((values, coc), (values.double(), coc.double()))
+    )
+    assert_close(got, want, 2e-6)
+
+
+def test_float32_under_another_default() -> None:
+    values, coc = scene(1, 3, 40, 30)
+    torch.set_default_dtype(F64)
+    try:
+        results_of = results(values, coc, Disc().profile(), MIDDLE, ones=True)
+    finally:
+        torch.set_default_dtype(F32)
+    assert all(t.dtype == F32 for t in results_of)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"merging": MIDDLE._replace(cells=0.0)}, "merging: expected cells above 0"),
+        ({"merging": MIDDLE._replace(cells=-1.0)}, "merging: expected cells above 0"),
+        ({"merging": MIDDLE._replace(highlight=math.nan)}, "merging: expected cells above 0"),
+        ({"highest": -1}, "highest: expected at least 0, got -1"),
+        ({"coc": torch.full((1, 1, 8, 9), math.inf)}, "coc: expected finite radii, got one of inf"),
+        ({"coc": torch.full((1, 1, 8, 9), math.nan)}, "coc: expected finite radii, got one of nan"),
+    ],
+)
+def test_bad_settings_are_named(change: dict[str, Any], message: str) -> None:
+    arguments = {"values": torch.rand(1, 3, 8, 9), "coc": torch.ones(1, 1, 8, 9), "merging": MIDDLE, **change}
+    with pytest.raises(ValueError, match=message):
+        splat_merged(profile=Disc().profile(), **arguments)
