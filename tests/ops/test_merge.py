@@ -580,8 +580,8 @@ def test_nothing_pops_while_the_focus_is_pulled(merging: Merging, most: float) -
     """Step by step across the first level border, the picture changes hardly more than the exact one.
 
     Steps are of 1/16 px. The two levels differ by the blur of interpolation, which the smaller radius only makes up for
-    in its second moment, and that difference comes in over the fade: steps are a fifth larger to a third smaller. Without
-    `FADE`, the worst step is 2.6 to 5.5 times the exact one.
+    in its second moment, and that difference comes in over the fade: steps are a fifth larger to a third smaller.
+    Without `FADE`, the worst step is 2.6 to 5.5 times the exact one.
     """
     border = int(16 * 2 * merging.cells)
     sweep = torch.arange(border - 4, int(border * (1 + FADE)) + 4, dtype=F64) / 16
