@@ -190,7 +190,7 @@ def splat_points(
     src = interleave(values).flatten(1).numpy()
     kernel = _splat_whole if _is_whole(points, rotation, position, pad) else _splat_between
     tables = _tables(index, points, counts, rotation, position, pad)
-    out = torch.empty(b * groups, 4, rows, columns)
+    out = torch.empty(b * groups, 4, rows, columns, dtype=torch.float32)
     for k in range(b * groups):
         n = k // groups
         pieces = []
@@ -218,7 +218,7 @@ def gather_points(
     buffer = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 1, 1, 1, 1)).numpy()
     kernel = _gather_whole if _is_whole(points, rotation, position, pad) else _gather_between
     tables = _tables(index, points, counts, rotation, position, pad)
-    out = torch.empty(b * groups, h, w, 4)
+    out = torch.empty(b * groups, h, w, 4, dtype=torch.float32)
     pieces = [
         (buffer[k], *tables[k // groups], pad, y0, y1, out[k].numpy())
         for k in range(b * groups)

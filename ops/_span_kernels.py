@@ -275,7 +275,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) 
     coc_np = coc.detach().contiguous().numpy()
     extent = max(abs(shapes[0, 0, 0]), abs(shapes[0, -1, 0]))
     reach = (coc.detach().abs().amax((1, 3)).clamp_min(MIN_RADIUS) * extent).numpy()
-    out = torch.empty(b * groups, 4, h, w)
+    out = torch.empty(b * groups, 4, h, w, dtype=torch.float32)
     out_np = out.numpy()
 
     def work(k: int, y0: int, y1: int) -> None:
@@ -295,7 +295,7 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
     src = interleave(values.detach()).numpy()
     differences = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 0, 2)).numpy()
     coc_np = coc.detach().contiguous().numpy()
-    grad_src = torch.empty(src.shape)
+    grad_src = torch.empty(src.shape, dtype=torch.float32)
     grad_coc = torch.zeros(groups, b, 1, h, w, dtype=torch.float64)
     grad_src_np, grad_coc_np = grad_src.numpy(), grad_coc.numpy()
 

@@ -238,14 +238,13 @@ def splat_merged(
         if not math.isfinite(largest):
             raise ValueError(f"coc: expected finite radii, got one of {largest}")
         highest = highest_level(largest, (h, w), merging)
-    if values.shape[1] + ones == 0 or coc.numel() == 0:
-        nothing = values * coc
-        return torch.cat([nothing, coc], 1) if ones else nothing
     dtype = compute_dtype(values, coc)
     source, radius = values.to(dtype), coc.to(dtype)
     weight = None if weight is None else weight.to(dtype)
     fixed = not (profile.knots.requires_grad or profile.bulge.requires_grad)
-    if has_kernel(source) and fixed:
+    if values.shape[1] + ones == 0 or coc.numel() == 0:
+        out = torch.cat([source * radius, radius], 1) if ones else source * radius
+    elif has_kernel(source) and fixed:
         knots, bulge = profile.knots.double(), profile.bulge.double()
         out = _splat_merged_op(source, radius, weight, knots, bulge, *merging, highest, ones, normalise)
     else:

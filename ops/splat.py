@@ -63,7 +63,11 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     check_image("profile.bulge", profile.bulge, (), like=values)
     dtype = compute_dtype(values, coc)
     work = working_dtype(values.device)
-    out = _splat_spans_op(values.to(dtype), coc.to(dtype), profile.knots.to(work), profile.bulge.to(work), integrate)
+    source, radius = values.to(dtype), coc.to(dtype)
+    if values.numel():
+        out = _splat_spans_op(source, radius, profile.knots.to(work), profile.bulge.to(work), integrate)
+    else:
+        out = source * radius
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
 
 

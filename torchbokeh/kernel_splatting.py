@@ -9,6 +9,7 @@ from torchbokeh._signed import signed_coc
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.convolve import CONVOLVE_FROM, blur_uniform
 from torchbokeh.ops.merge import highest_level, splat_merged
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
@@ -27,6 +28,7 @@ class SplattingPlan:
         highest: the coarsest level that pixels are merged on; 0 if none are.
         predicted_error: relative L1 error against the exact splat, see `Quality`.
         sharp: every radius is below half a pixel: the image passes through.
+        uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
     """
 
     size: tuple[int, int]
@@ -35,12 +37,15 @@ class SplattingPlan:
     highest: int
     predicted_error: float
     sharp: bool
+    uniform: float | None = None
 
     def __str__(self) -> str:
         height, width = self.size
         head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
         if self.sharp:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.uniform is not None:
+            return f"{head}\nEvery pixel has the same PSF: a single convolution."
         if self.highest == 0:
             return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
         return (
@@ -97,14 +102,18 @@ class KernelSplatting(nn.Module):
         return self._plan(image, self._checked(image, coc))
 
     def _plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
-        radius = coc.detach().abs()
+        coc = coc.detach()
+        radius = coc.abs()
         size = (image.shape[-2], image.shape[-1])
         if image.numel() == 0:
             return SplattingPlan(size, 0.0, QUALITIES[0], 0, 0.0, True)
-        largest, *shares = torch.stack([radius.amax(), *merged_shares(radius, self.quality, self.tolerance)]).tolist()
+        look = [*coc.aminmax(), *merged_shares(radius, self.quality, self.tolerance)]
+        low, high, *shares = torch.stack(look).tolist()
+        largest = max(-low, high)
         quality, error = choose(self.quality, self.tolerance, shares)
         highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
-        return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS)
+        one = low if low == high and highest == 0 and largest >= CONVOLVE_FROM else None
+        return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS, one)
 
     def forward(self, image: Tensor, coc: Tensor, *, plan: SplattingPlan | None = None) -> Tensor:
         """Blur a picture.
@@ -134,7 +143,9 @@ class KernelSplatting(nn.Module):
             dtype = compute_dtype(image, coc)
             source, radius, profile = image.to(dtype), coc.to(dtype), self.aperture.profile()
             merging = plan.quality.merging
-            if merging is None:
+            if plan.uniform is not None and not coc.requires_grad:
+                out = blur_uniform(source, plan.uniform, profile)
+            elif merging is None:
                 out = splat_spans(torch.cat([source, torch.ones_like(radius)], 1), radius, profile, integrate=True)
                 out = out[:, :-1] / out[:, -1:].clamp_min(TINY)
             else:

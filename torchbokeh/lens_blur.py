@@ -21,6 +21,7 @@ from torchbokeh.layers import (
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.convolve import blur_uniform
 from torchbokeh.ops.merge import Merging, highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan
@@ -111,13 +112,17 @@ class LensBlur(nn.Module):
         One small copy from the device, which a forward pass with ``plan=`` saves.
         """
         _, signed, cut = self._inputs(image, depth, coc, background)
+        return self._plan(image, signed, cut, background is not None)
+
+    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, background: bool) -> Plan:
         with torch.no_grad():
             if image.numel() == 0:
                 raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
             if image.dim() == 5:
                 return self._plan_layers(image, signed, cut)
             *_, height, width = image.shape
-            look = [*signed.aminmax(), cut.to(signed.dtype).mean(), *self._shares(signed)]
+            share = signed.new_zeros(()) if cut is None else cut.to(signed.dtype).mean()
+            look = [*signed.aminmax(), share, *self._shares(signed)]
             low, high, clamped, *shares = torch.stack(look).tolist()
             quality, error = choose(self.quality, self.tolerance, shares)
             start, stop = FOREGROUND
@@ -128,7 +133,7 @@ class LensBlur(nn.Module):
             if in_front:
                 ahead = self.layers or (1 if quality.coarse else quality.bins)
                 bins = bin_centres(low, stop, ahead), bin_centres(start, high, most)
-                hidden = "filled" if background is None else "given"
+                hidden = "given" if background else "filled"
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
@@ -139,12 +144,12 @@ class LensBlur(nn.Module):
     def _shares(self, signed: Tensor) -> list[Tensor]:
         return merged_shares(signed, self.quality, self.tolerance)
 
-    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor) -> Plan:
+    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None) -> Plan:
         *_, height, width = image.shape
         held = image[:, :, 3:] > 0
         low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
         high = torch.where(held, signed, -torch.inf).movedim(1, 0).flatten(1).amax(1)
-        share = (cut & held).sum() / held.sum().clamp_min(1)
+        share = low.new_zeros(()) if cut is None else (cut & held).sum() / held.sum().clamp_min(1)
         shares = self._shares(torch.where(held, signed, 0.0))
         least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(low.dtype)
         look = torch.cat([low, high, least, torch.stack([share.to(low.dtype), *shares])]).tolist()
@@ -215,11 +220,11 @@ class LensBlur(nn.Module):
             TypeError: an argument is not a floating-point tensor, or not a `Plan`.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        behind, signed, _ = self._inputs(image, depth, coc, background)
+        behind, signed, cut = self._inputs(image, depth, coc, background)
         if image.numel() == 0:
             return image.clone() if image.dim() == 4 else image.sum(1)
         if plan is None:
-            plan = self.plan(image, depth, coc=coc, background=background)
+            plan = self._plan(image, signed, cut, background is not None)
         self._check_plan(plan, image, background)
         if plan.sharp and not signed.requires_grad:
             return image.clone()
@@ -244,6 +249,8 @@ class LensBlur(nn.Module):
                     if surfaces
                     else torch.zeros_like(source[:, 0])
                 )
+            elif plan.uniform is not None and not signed.requires_grad:
+                out = blur_uniform(source, plan.uniform, self.aperture.profile())
             elif len(plan.bins) == 2:
                 out = self._over_rest(source, radii, behind, plan, pieces, merging)
             else:
@@ -271,13 +278,13 @@ class LensBlur(nn.Module):
 
     def _inputs(
         self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background
-    ) -> tuple[tuple[Tensor, Tensor | None] | None, Tensor, Tensor]:
+    ) -> tuple[tuple[Tensor, Tensor | None] | None, Tensor, Tensor | None]:
         """Check everything; return the background with its CoC, the signed CoC, and where ``max_coc`` cut it."""
         layered = isinstance(image, Tensor) and image.dim() == 5
         check_image("image", image, ("B", "L", 4, "H", "W") if layered else ("B", "C", "H", "W"))
         signed = signed_coc(self.lens, image, depth, coc)
         limit = self.max_coc
-        cut = torch.zeros_like(signed, dtype=torch.bool) if limit is None else signed.abs() > limit
+        cut = None if limit is None else signed.abs() > limit
         signed = signed if limit is None else signed.clamp(-limit, limit)
         if background is None:
             return None, signed, cut

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from torchbokeh.ops.convolve import CONVOLVE_FROM
 from torchbokeh.quality import Quality
 
 Hidden = Literal["nothing", "filled", "given", "layers"]
@@ -49,12 +50,21 @@ class Plan:
     highest: int
     predicted_error: float
 
+    @property
+    def uniform(self) -> float | None:
+        """The signed radius in px that all pixels share, where one convolution does it; else None."""
+        low, high = self.coc_range
+        one = low == high and abs(low) >= CONVOLVE_FROM and self.hidden == "nothing" and self.highest == 0
+        return low if one else None
+
     def __str__(self) -> str:
         height, width = self.size
         low, high = self.coc_range
         head = f"{width} x {height} image, CoC {low:+.1f} to {high:+.1f} px (negative: in front of the focus plane)."
         if self.sharp:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.uniform is not None:
+            return f"{head}\nEvery pixel has the same PSF ({self.aperture}): a single convolution."
         lines = [head]
         counts = " and ".join(str(len(b)) for b in self.bins)
         if self.hidden == "layers":

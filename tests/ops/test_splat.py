@@ -15,6 +15,7 @@ import torchbokeh.ops.splat
 from torchbokeh.ops import _dispatch
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import running_sum_x
+from torchbokeh.ops.merge import Merging, splat_merged
 from torchbokeh.ops.spans import Profile
 from torchbokeh.ops.splat import PointTable, splat_points, splat_spans
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
@@ -70,14 +71,31 @@ def test_tiny_images(shape: Aperture, dtype: torch.dtype, size: tuple[int, int])
     assert_close(splat_spans(values, coc, shape.profile(), integrate=True), want, 1e-5)
 
 
-@pytest.mark.parametrize("dtype", [F32, F64])
-def test_an_empty_batch(dtype: torch.dtype) -> None:
-    values = torch.zeros(0, 3, 4, 5, dtype=dtype, requires_grad=True)
-    coc = torch.zeros(0, 1, 4, 5, dtype=dtype)
-    out = splat_spans(values, coc, Disc().profile())
-    assert out.shape == values.shape
-    out.sum().backward()
+@pytest.mark.parametrize("dtype", [torch.float16, F32, F64])
+@pytest.mark.parametrize("size", [(0, 3, 4, 5), (2, 0, 4, 5), (2, 3, 0, 5), (2, 3, 4, 0)])
+def test_empty_pictures(dtype: torch.dtype, size: tuple[int, ...]) -> None:
+    values = torch.zeros(size, dtype=dtype, requires_grad=True)
+    coc = torch.zeros(size[0], 1, *size[2:], dtype=dtype)
+    merged = splat_merged(values, coc.float(), Disc().profile(), Merging(4.0, 0.015))
+    for out in (splat_spans(values, coc, Disc().profile()), merged):
+        assert out.shape == values.shape
+        assert out.dtype == values.dtype
+        out.sum().backward()
     assert values.grad is not None
+
+
+def test_the_default_dtype_changes_nothing() -> None:
+    values, coc = scene(1, 2, 9, 14, F32)
+    profile, asked = Disc().profile(), coc.clone().requires_grad_()
+    want = splat_spans(values, asked, profile)
+    torch.set_default_dtype(F64)
+    try:
+        out = splat_spans(values, asked, profile)
+        grad = torch.autograd.grad(out.sum(), asked)
+    finally:
+        torch.set_default_dtype(F32)
+    assert torch.equal(out, want)
+    assert torch.equal(grad[0], torch.autograd.grad(want.sum(), asked)[0])
 
 
 @pytest.mark.parametrize("dtype", [F32, F64])

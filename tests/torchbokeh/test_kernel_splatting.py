@@ -201,3 +201,20 @@ def test_memory_is_that_of_the_docstring(quality: str, way: str, most: float, ra
         command, capture_output=True, text=True, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
     assert 10 < float(done.stdout) < most
+
+
+@pytest.mark.parametrize(("radius", "single"), [(7.9, False), (8.0, True), (-11.3, True)])
+@pytest.mark.parametrize("aperture", ["disc", "5-gon"])
+def test_one_radius_for_all_takes_a_single_convolution(radius: float, single: bool, aperture: str) -> None:
+    splatting = KernelSplatting(aperture, quality="exact")
+    image, coc = torch.rand(2, 3, 30, 41), torch.full((2, 1, 30, 41), radius)
+    plan = splatting.plan(image, coc)
+    assert (plan.uniform is not None) == single == ("a single convolution" in str(plan))
+    torch.testing.assert_close(
+        splatting(image, coc), splatting(image, coc, plan=dataclasses.replace(plan, uniform=None)), rtol=1e-5, atol=1e-6
+    )
+    asked = coc.clone().requires_grad_()
+    splatting(image, asked).square().sum().backward()
+    assert float(asked.grad.abs().max()) > 0
+    coc[0, 0, 3, 4] += 0.1
+    assert splatting.plan(image, coc).uniform is None

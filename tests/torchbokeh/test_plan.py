@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh import LensBlur, Plan
+from torchbokeh import KernelSplatting, LensBlur, Plan
 from torchbokeh.layers import FOREGROUND
 from torchbokeh.quality import QUALITIES
 
@@ -296,3 +296,18 @@ def test_a_plan_needs_no_gradient() -> None:
     depth = halves(1.0, 5.0)
     assert LensBlur(lens).plan(picture().requires_grad_(), depth) == LensBlur(lens).plan(picture(), depth)
     assert isinstance(LensBlur(lens).plan(picture(), depth), Plan)
+
+
+@pytest.mark.parametrize("radius", [9.0, -12.5])
+def test_one_radius_for_all_takes_a_single_convolution(radius: float) -> None:
+    image, coc = picture(), torch.full_like(halves(0, 0), radius)
+    blur = LensBlur(aperture="5-gon")
+    plan = blur.plan(image, coc=coc)
+    assert plan.uniform == radius
+    assert str(plan).endswith("a single convolution.")
+    want = KernelSplatting("5-gon", quality="exact")(image, coc)
+    torch.testing.assert_close(blur(image, coc=coc), want)
+    by_splats = blur(image, coc=coc.clone().requires_grad_(), plan=plan)
+    torch.testing.assert_close(by_splats, want, rtol=1e-5, atol=1e-6)
+    assert blur.plan(image, coc=halves(radius, radius + 0.1)).uniform is None
+    assert LensBlur(quality="fast").plan(image, coc=coc).uniform is None  # merging is faster yet

@@ -41,15 +41,19 @@ class Timing:
         }
 
 
+FEWEST = 3
+"""Timed runs of what takes longer than its budget."""
+
+
 def measure(works: Mapping[str, Work], repeat: int, budget: float = math.inf) -> dict[str, Timing]:
     """Time several things by turns, so that what disturbs the machine for a while disturbs them all.
 
-    Each runs once to warm up. Where that takes more than half the budget it is the one timed run.
+    Each runs once to warm up, which counts as a timed run where it takes longer than the budget.
 
     Args:
         works: what to time, by name.
         repeat: timed runs of each.
-        budget: seconds for the timed runs of each; at least one is made.
+        budget: seconds for the timed runs of each; `FEWEST` are made in any case, unless ``repeat`` is less.
 
     Returns:
         The timings, by name.
@@ -65,10 +69,12 @@ def measure(works: Mapping[str, Work], repeat: int, budget: float = math.inf) ->
             start = time.perf_counter()
             results[name] = work()
             first = time.perf_counter() - start
-            seconds[name] = [first] if first > budget / 2 else []
+            seconds[name] = [first] if first > budget else []
         for _ in range(repeat):
             for name, work in works.items():
-                if seconds[name] and sum(seconds[name]) + max(seconds[name]) > budget:
+                done = len(seconds[name])
+                spent = done >= FEWEST and sum(seconds[name]) + max(seconds[name]) > budget
+                if spent or done == repeat:
                     continue
                 start = time.perf_counter()
                 work()

@@ -71,14 +71,20 @@ def test_every_work_is_warmed_up_and_takes_its_turns():
     assert [found[name].row["runs"] for name in "ab"] == [2, 2]
 
 
-def test_slow_work_runs_once():
+@pytest.mark.parametrize(
+    ("repeat", "budget", "calls", "runs"), [(5, 0.01, 3, 3), (5, 0.1, 4, 3), (2, 0.1, 3, 2), (1, 0.01, 1, 1)]
+)
+def test_slow_work_runs_three_times(repeat, budget, calls, runs):
+    said = []
+
     def slow():
+        said.append(1)
         time.sleep(0.06)
         return torch.zeros(1)
 
-    row = measure({"slow": slow}, repeat=5, budget=0.1)["slow"].row
-    assert row["runs"] == 1
-    assert row["seconds"] >= 0.06
+    row = measure({"slow": slow}, repeat=repeat, budget=budget)["slow"].row
+    assert (len(said), row["runs"]) == (calls, runs)
+    assert row["fastest"] >= 0.06
 
 
 def test_a_row_has_median_and_spread():
