@@ -10,8 +10,8 @@ from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.convolve import CONVOLVE_FROM, blur_uniform
-from torchbokeh.ops.merge import highest_level, splat_merged
-from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.ops.merge import Merging, highest_level, splat_merged
+from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
@@ -142,19 +142,29 @@ class KernelSplatting(nn.Module):
         with torch.autocast(image.device.type, enabled=False):
             dtype = compute_dtype(image, coc)
             source, radius, profile = image.to(dtype), coc.to(dtype), self.aperture.profile()
-            merging = plan.quality.merging
             if plan.uniform is not None and not coc.requires_grad:
                 out = blur_uniform(source, plan.uniform, profile)
-            elif merging is None:
-                out = splat_spans(torch.cat([source, torch.ones_like(radius)], 1), radius, profile, integrate=True)
-                out = out[:, :-1] / out[:, -1:].clamp_min(TINY)
             else:
-                out = splat_merged(source, radius, profile, merging, highest=plan.highest, ones=True, normalise=True)[
-                    :, :-1
-                ]
+                out = blur_one_layer(source, radius, profile, plan.quality.merging, plan.highest)
         return out.to(image.dtype)
 
     @staticmethod
     def _checked(image: Tensor, coc: Tensor) -> Tensor:
         check_image("image", image, ("B", "C", "H", "W"))
         return signed_coc(None, image, None, coc)
+
+
+def blur_one_layer(image: Tensor, coc: Tensor, profile: Profile, merging: Merging | None, highest: int) -> Tensor:
+    """Splat ``image (B, C, H, W)`` with ``coc (B, 1, H, W)`` and divide by the coverage.
+
+    Args:
+        image: linear radiance.
+        coc: signed radius in px.
+        profile: the unit shape of the PSF.
+        merging: how far to merge by radius; ``None``: not at all.
+        highest: the coarsest level to merge on.
+    """
+    if merging is None:
+        out = splat_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, profile, integrate=True)
+        return out[:, :-1] / out[:, -1:].clamp_min(TINY)
+    return splat_merged(image, coc, profile, merging, highest=highest, ones=True, normalise=True)[:, :-1]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc, signed_map
+from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
     FOREGROUND,
@@ -253,6 +254,8 @@ class LensBlur(nn.Module):
                 out = blur_uniform(source, plan.uniform, self.aperture.profile())
             elif len(plan.bins) == 2:
                 out = self._over_rest(source, radii, behind, plan, pieces, merging)
+            elif len(plan.bins[0]) == 1 and len(pieces) == 1:
+                out = blur_one_layer(source, radii, pieces[0], merging, plan.highest)
             else:
                 out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces, merging, plan.highest)
         return out.to(image.dtype)
