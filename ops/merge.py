@@ -98,8 +98,12 @@ def level_shares(
 
 
 def merge_cells(
-    values: Tensor, coc: Tensor, shares: list[Tensor], weight: Tensor | None = None
-) -> list[tuple[Tensor, Tensor]]:
+    values: Tensor,
+    coc: Tensor,
+    shares: list[Tensor],
+    weight: Tensor | None = None,
+    labels: Tensor | None = None,
+) -> list[tuple[Tensor, ...]]:
     """The pictures that are splatted: values and signed CoC in cells, for every level.
 
     Args:
@@ -107,12 +111,13 @@ def merge_cells(
         coc: ``(B, 1, H, W)`` signed radius in px.
         shares: those of `level_shares`.
         weight: ``(B, 1, H, W)`` >= 0, factor of the values; a pixel counts by it in the mean radius. ``None``: 1.
+        labels: ``(B, E, H, W)``, more of what a PSF depends on.
 
     Returns:
-        For level ``l`` the sums ``(B, C, h, w)`` over blocks of ``2**l x 2**l`` pixels, h and w rounded up, and the
-        mean radius ``(B, 1, h, w)`` in cells, with the sign that prevails.
+        For level ``l`` the sums ``(B, C, h, w)`` over blocks of ``2**l x 2**l`` pixels, h and w rounded up; the mean
+        radius ``(B, 1, h, w)`` in cells, with the sign that prevails; and the means ``(B, E, h, w)`` of the labels.
     """
-    levels = []
+    levels: list[tuple[Tensor, ...]] = []
     for level, share in enumerate(shares):
         size = 2**level
         border = (0, -values.shape[3] % size, 0, -values.shape[2] % size)
@@ -121,19 +126,19 @@ def merge_cells(
             return F.avg_pool2d(F.pad(t, border), size) * size**2 if size > 1 else t
 
         counted = share if weight is None else share * weight.detach()
-        radius = total(counted * coc.abs()) / total(counted).clamp_min(TINY) / size
+        amount = total(counted).clamp_min(TINY)
+        radius = total(counted * coc.abs()) / amount / size
         if level:
             radius = (radius.square() - SPREAD).clamp_min(MIN_RADIUS**2).sqrt()
         rounded = (radius.detach() * STEPS).round() / STEPS
         radius = radius + (rounded - radius.detach())
         factor = share if weight is None else share * torch.where(weight > 0, weight, 0.0)
         # What is infinite stays on its own levels.
-        levels.append(
-            (
-                total(torch.where(factor > 0, values * factor, 0.0)),
-                torch.where(total(counted * coc.detach()) < 0, -radius, radius),
-            )
+        level_maps = (
+            total(torch.where(factor > 0, values * factor, 0.0)),
+            torch.where(total(counted * coc.detach()) < 0, -radius, radius),
         )
+        levels.append(level_maps if labels is None else (*level_maps, total(counted * labels) / amount))
     return levels
 
 
@@ -150,10 +155,11 @@ def upsample(coarse: Tensor) -> Tensor:
 def merged(
     values: Tensor,
     coc: Tensor,
-    splat: Callable[[Tensor, Tensor], Tensor],
+    splat: Callable[..., Tensor],
     merging: Merging,
     highest: int,
     weight: Tensor | None = None,
+    labels: Tensor | None = None,
 ) -> Tensor:
     """Splat with merging, for any PSF.
 
@@ -161,19 +167,21 @@ def merged(
         values: ``(B, C, H, W)``, what each pixel spreads.
         coc: ``(B, 1, H, W)`` signed radius in px.
         splat: takes values ``(B, C, h, w)`` and radii ``(B, 1, h, w)`` in cells and returns the blurred picture
-            ``(B, C, h, w)``.
+            ``(B, C, h, w)``. With ``labels`` it takes their means and the size of a cell in px as well.
         merging: how far to merge.
         highest: the coarsest level, see `highest_level`.
         weight: ``(B, 1, H, W)`` >= 0, factor of the values. Pixels without weight do not take part.
+        labels: ``(B, E, H, W)``, more of what a PSF depends on; cells take their means.
 
     Returns:
         ``(B, C, H, W)``, close to ``splat(weight * values, coc)``.
     """
-    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, weight), weight)
+    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, weight), weight, labels)
 
     def picture(level: int) -> Tensor:
         margin = MARGIN if level else 0
-        out = splat(*(F.pad(t, (margin,) * 4) for t in levels[level]))
+        maps = [F.pad(t, (margin,) * 4) for t in levels[level]]
+        out = splat(*maps) if labels is None else splat(*maps, 2**level)
         if level == highest:
             return out
         start, (h, w) = 2 * MARGIN - margin, out.shape[2:]

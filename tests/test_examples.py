@@ -19,6 +19,7 @@ PICTURES = {  # name, size, frames
     "focus_pull.py": ("new/a.gif", (74, 50), 4),
     "scenes.py": ("new/a.png", (128, 192), 1),
     "operating_points.py": ("new/a.png", (148, 100), 1),
+    "logo_bokeh.py": ("new/a.png", (80, 48), 1),
 }
 
 

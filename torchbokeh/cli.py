@@ -1,4 +1,4 @@
-"""Command line: ``torchbokeh render``, ``demo``, ``dataset`` and ``report``, also as ``python -m torchbokeh``."""
+"""Command line: ``torchbokeh`` and its commands, also as ``python -m torchbokeh``."""
 
 import argparse
 import math
@@ -15,6 +15,7 @@ from torch import Tensor
 
 import torchbokeh
 from torchbokeh.cli_dataset import add_dataset
+from torchbokeh.cli_psfs import add_psfs
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
@@ -73,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(run=_demo)
     add_dataset(commands.add_parser("dataset", help="write scenes with ground truth to train on", allow_abbrev=False))
     add_report(commands.add_parser("report", help="measure error against run time here", allow_abbrev=False))
+    add_psfs(commands.add_parser("psfs", help="build and show banks of point-spread functions", allow_abbrev=False))
     return parser
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc
+from torchbokeh.bank_splatting import splat_bank
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.composite import TINY
@@ -14,6 +15,8 @@ from torchbokeh.ops.merge import Merging, highest_level, splat_merged
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.model import Labels
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
 
@@ -85,21 +88,36 @@ class KernelSplatting(nn.Module):
     """
 
     def __init__(
-        self, aperture: str | Aperture = "disc", quality: str = "balanced", *, tolerance: float | None = None
+        self,
+        aperture: str | Aperture = "disc",
+        quality: str = "balanced",
+        *,
+        tolerance: float | None = None,
+        bank: PsfBank | None = None,
+        interpolate: bool = False,
     ) -> None:
         super().__init__()
         check_quality(quality, tolerance)
+        if bank is not None and not isinstance(bank, PsfBank):
+            raise TypeError(f"bank: expected a PsfBank or None, got {type(bank).__name__}")
+        if bank is not None and aperture != "disc":
+            raise ValueError(f"aperture: expected none beside a bank, whose PSFs have their own shape, got {aperture}")
         self.aperture = parse_aperture(aperture)
         self.quality = quality
         self.tolerance = tolerance
+        self.bank = bank
+        self.interpolate = interpolate
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
         return f"quality={self.quality!r}" if self.tolerance is None else f"tolerance={self.tolerance}"
 
-    def plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
+    def plan(
+        self, image: Tensor, coc: Tensor, *, depth: Tensor | None = None, motion: Tensor | None = None
+    ) -> SplattingPlan:
         """Look at the radii once, in one small copy from the device. Arguments are those of `forward`."""
-        return self._plan(image, self._checked(image, coc))
+        self._labels(image, coc, depth, motion)
+        return self._plan(image, coc)
 
     def _plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
         coc = coc.detach()
@@ -112,15 +130,27 @@ class KernelSplatting(nn.Module):
         largest = max(-low, high)
         quality, error = choose(self.quality, self.tolerance, shares)
         highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
+        if self.bank is not None:
+            return SplattingPlan(size, largest, quality, highest if self.bank.model.merges else 0, error, False)
         one = low if low == high and highest == 0 and largest >= CONVOLVE_FROM else None
         return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS, one)
 
-    def forward(self, image: Tensor, coc: Tensor, *, plan: SplattingPlan | None = None) -> Tensor:
+    def forward(
+        self,
+        image: Tensor,
+        coc: Tensor,
+        *,
+        depth: Tensor | None = None,
+        motion: Tensor | None = None,
+        plan: SplattingPlan | None = None,
+    ) -> Tensor:
         """Blur a picture.
 
         Args:
             image: ``(B, C, H, W)`` linear radiance, any number of channels.
             coc: ``(B, 1, H, W)`` signed radius in px.
+            depth: ``(B, 1, H, W)`` metres, for a bank whose model asks for it.
+            motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter, likewise.
             plan: a plan made earlier with `plan`; the radii are then not looked at again.
 
         Returns:
@@ -130,7 +160,7 @@ class KernelSplatting(nn.Module):
             TypeError: an argument is not a floating-point tensor, or not a `SplattingPlan`.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        self._checked(image, coc)
+        labels = self._labels(image, coc, depth, motion)
         if plan is None:
             plan = self._plan(image, coc)
         elif not isinstance(plan, SplattingPlan):
@@ -142,16 +172,37 @@ class KernelSplatting(nn.Module):
         with torch.autocast(image.device.type, enabled=False):
             dtype = compute_dtype(image, coc)
             source, radius, profile = image.to(dtype), coc.to(dtype), self.aperture.profile()
-            if plan.uniform is not None and not coc.requires_grad:
+            if self.bank is not None:
+                labels = Labels(*(None if t is None else t.to(dtype) for t in labels))
+                out = self._from_bank(self.bank, source, labels, plan)
+            elif plan.uniform is not None and not coc.requires_grad:
                 out = blur_uniform(source, plan.uniform, profile)
             else:
                 out = blur_one_layer(source, radius, profile, plan.quality.merging, plan.highest)
         return out.to(image.dtype)
 
-    @staticmethod
-    def _checked(image: Tensor, coc: Tensor) -> Tensor:
+    def _from_bank(self, bank: PsfBank, image: Tensor, labels: Labels, plan: SplattingPlan) -> Tensor:
+        count = bank.values.shape[1]
+        ones = torch.ones_like(image[:, :1]).expand(-1, count, -1, -1)
+        merging = plan.quality.merging
+        covered = torch.cat([image, ones], 1)
+        out = splat_bank(covered, labels, bank, merging, highest=plan.highest, interpolate=self.interpolate)
+        coverage = out[:, -count:].clamp_min(TINY).repeat(1, image.shape[1] // count, 1, 1)
+        return out[:, :-count] / coverage
+
+    def _labels(self, image: Tensor, coc: Tensor, depth: Tensor | None, motion: Tensor | None) -> Labels:
         check_image("image", image, ("B", "C", "H", "W"))
-        return signed_coc(None, image, None, coc)
+        b, channels, h, w = image.shape
+        signed = signed_coc(None, image, None, coc)
+        for name, given, count in (("depth", depth, 1), ("motion", motion, 2)):
+            if given is None:
+                continue
+            if self.bank is None:
+                raise ValueError(f"{name}: expected None without a bank, got a tensor")
+            check_image(name, given, (b, count, h, w), like=image)
+        if self.bank is not None and channels % self.bank.values.shape[1]:
+            raise ValueError(f"image: expected a multiple of 3 channels for coloured PSFs, got {channels}")
+        return Labels(signed, depth, motion)
 
 
 def blur_one_layer(image: Tensor, coc: Tensor, profile: Profile, merging: Merging | None, highest: int) -> Tensor:

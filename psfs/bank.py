@@ -1,0 +1,250 @@
+"""Banks: the sparse PSFs of a whole model in one file (LKS section 6.1)."""
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchbokeh.ops.points import PointTable
+from torchbokeh.psfs.model import PsfModel
+from torchbokeh.psfs.models import MODELS, model_from
+from torchbokeh.psfs.represent import DOMAINS, Domain, Represented
+
+FORMAT, VERSION = "torchbokeh-psf-bank", 1
+BANKS = Path(__file__).parent / "banks"
+"""Where the banks that come with the package are."""
+
+LARGEST_FILE = 64 << 20
+"""Bytes of a file of a bank, at most: what is larger is refused before it is read."""
+
+_DTYPES = {"offsets": torch.int16, "values": torch.float32, "counts": torch.int32, "domains": torch.uint8}
+
+
+class PsfBank(nn.Module):
+    """The samples of a PSF model as sparse points, each in the domain that suits it.
+
+    Args:
+        model: whose samples they are; its grid tells which sample a coordinate takes.
+        samples: one for each box of the grid, in order.
+        info: anything to keep with them that JSON can hold.
+
+    Attributes:
+        offsets: ``(P, 2)`` int16, points as (dx, dy) in px from the centre, one sample after the other.
+        values: ``(P, C)`` float32; C is 1, or 3 for coloured PSFs.
+        counts: ``(K+1,)`` int32: sample k owns the points ``counts[k] .. counts[k+1]-1``.
+        domains: ``(K,)`` uint8, indices into `torchbokeh.psfs.represent.DOMAINS`.
+
+    Raises:
+        ValueError: the number of samples is not that of the grid.
+
+    Example:
+        >>> bank = PsfBank.load("combined")
+        >>> bank.model.name, len(bank) == len(bank.model.grid)
+        ('combined', True)
+    """
+
+    offsets: Tensor
+    values: Tensor
+    counts: Tensor
+    domains: Tensor
+
+    def __init__(self, model: PsfModel, samples: Sequence[Represented], info: dict[str, Any] | None = None) -> None:
+        super().__init__()
+        if len(samples) != len(model.grid):
+            raise ValueError(f"samples: expected {len(model.grid)} for {model.name}, got {len(samples)}")
+        self.model = model
+        self.info = dict(info or {})
+        sizes = [len(s.sparse.points) for s in samples]
+        self.register_buffer("offsets", torch.from_numpy(np.concatenate([s.sparse.points for s in samples])).short())
+        self.register_buffer("values", torch.from_numpy(np.concatenate([s.sparse.values for s in samples])).float())
+        self.register_buffer("counts", torch.tensor([0, *np.cumsum(sizes)], dtype=torch.int32))
+        self.register_buffer("domains", torch.tensor([DOMAINS.index(s.domain) for s in samples], dtype=torch.uint8))
+
+    def __len__(self) -> int:
+        """The number of samples."""
+        return len(self.domains)
+
+    def extra_repr(self) -> str:
+        """Model and size, for ``print``."""
+        return f"{self.model.name}, {len(self)} samples, {len(self.offsets)} points"
+
+    def sample(self, number: int) -> Represented:
+        """One sample as it was built, its values rounded to float32."""
+        from torchbokeh.psfs.refit import Sparse
+
+        first, last = self.counts[number : number + 2].tolist()
+        points = self.offsets[first:last].cpu().numpy().astype(np.int64)
+        return Represented(
+            DOMAINS[int(self.domains[number])], Sparse(points, self.values[first:last].cpu().double().numpy())
+        )
+
+    def table(self, domain: Domain, channel: int = 0) -> PointTable:
+        """The points of one domain as a table of all samples, for `torchbokeh.ops.points.splat_points`.
+
+        Samples of other domains have no points in it.
+        """
+        here = self.domains == DOMAINS.index(domain)
+        sizes = self.counts.diff()
+        chosen = here.repeat_interleave(sizes)
+        counts = torch.cat([sizes.new_zeros(1), torch.where(here, sizes, 0).cumsum(0)])
+        return PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts.long())
+
+    def reach(self) -> Tensor:
+        """Largest distance ``(K,)`` in px of a point of each sample from its centre, along x or y."""
+        far = self.offsets.float().abs().amax(1)
+        found = far.new_zeros(len(self))
+        owner = torch.arange(len(self), device=far.device).repeat_interleave(self.counts.diff())
+        return found.scatter_reduce(0, owner, far, "amax")
+
+    def gains(self) -> Tensor:
+        """What each sample sums to, ``(K, C)``: 1, but for the fit, unless the model tints.
+
+        The sum of the values in the direct domain; minus their first moment along x after row differences; a quarter of
+        their second moment in the Laplacian domain, since the Laplacian of ``x**2 + y**2`` is 4.
+        """
+        x, y = self.offsets.double().unbind(1)
+        owner = torch.arange(len(self), device=x.device).repeat_interleave(self.counts.diff())
+        factors = torch.stack([torch.ones_like(x), -x, (x * x + y * y) / 4])
+        factor = factors.gather(0, self.domains.long()[owner][None])[0]
+        sums = self.values.new_zeros(len(self), self.values.shape[1], dtype=torch.float64)
+        return sums.index_add(0, owner, self.values.double() * factor[:, None]).float()
+
+    def save(self, path: str | Path) -> None:
+        """Write a safetensors file: all of it, or nothing.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from safetensors.torch import save
+
+        tensors = {name: getattr(self, name).cpu().contiguous() for name in _DTYPES}
+        head = {
+            "format": FORMAT,
+            "version": VERSION,
+            "model": self.model.name,
+            "settings": self.model.settings(),
+            "grid": _grid_of(self.model),
+            "info": self.info,
+            "digest": _digest(tensors),
+        }
+        content = save(tensors, {"torchbokeh": json.dumps(head, sort_keys=True)})
+        path = Path(path)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+            os.chmod(temporary, 0o666 & ~_umask())
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, source: str | Path, model: PsfModel | None = None) -> "PsfBank":
+        """Read a bank that `save` wrote.
+
+        Args:
+            source: a file, or the name of a model whose bank comes with the package.
+            model: whose samples they are, if the file is of a model of your own.
+
+        Raises:
+            FileNotFoundError: there is no such file, and no model of that name.
+            ValueError: the file is no bank, was cut or changed, or belongs to another version.
+        """
+        path = BANKS / f"{source}.safetensors" if source in MODELS else Path(source)
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"source: expected a file or one of {', '.join(sorted(MODELS))}, got {str(source)!r}"
+            )
+        head, tensors = _read(path)
+        if model is None:
+            model = model_from(head["model"], head["settings"])
+        elif model.name != head["model"]:
+            raise ValueError(f"model: expected {head['model']!r}, whose bank {path} is, got {model.name!r}")
+        if _grid_of(model) != head["grid"]:
+            raise ValueError(f"{path}: its samples stand elsewhere than those of this version's model {model.name!r}")
+        bank = cls.__new__(cls)
+        nn.Module.__init__(bank)
+        bank.model, bank.info = model, head["info"]
+        for name, tensor in tensors.items():
+            bank.register_buffer(name, tensor)
+        return bank
+
+
+def installed() -> list[str]:
+    """Models whose banks come with the package."""
+    return [name for name in MODELS if (BANKS / f"{name}.safetensors").is_file()]
+
+
+def _grid_of(model: PsfModel) -> list[list[float]]:
+    grid = model.grid
+    return [list(grid.bounds), list(grid.betas), list(grid.cells)]
+
+
+def _umask() -> int:
+    now = os.umask(0)
+    os.umask(now)
+    return now
+
+
+def _digest(tensors: dict[str, Tensor]) -> str:
+    found = hashlib.sha256()
+    for name in _DTYPES:
+        found.update(tensors[name].numpy().tobytes())
+    return found.hexdigest()
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Header and tensors of a file, checked."""
+    from safetensors import SafetensorError, safe_open
+
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise ValueError(f"{path}: expected at most {LARGEST_FILE >> 20} MB, got {size >> 20} MB")
+    try:
+        with safe_open(path, "pt") as file:
+            text = (file.metadata() or {}).get("torchbokeh")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dictionary
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: expected a safetensors file, but it is cut or something else ({error})") from error
+    if text is None:
+        raise ValueError(f"{path}: expected a bank of PSFs, got another safetensors file")
+    try:
+        head = json.loads(text)
+        version = head["version"] if head["format"] == FORMAT else None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a bank of PSFs, but its header cannot be read ({error})") from error
+    if version != VERSION:
+        raise ValueError(f"{path}: expected a bank of PSFs of version {VERSION}, got version {version}")
+    _check(path, head, tensors)
+    return head, tensors
+
+
+def _check(path: Path, head: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Raise a ValueError unless the contents are what `PsfBank.save` writes."""
+    if {name: t.dtype for name, t in tensors.items()} != _DTYPES:
+        raise ValueError(f"{path}: expected the tensors {', '.join(_DTYPES)}, got {', '.join(tensors) or 'none'}")
+    if head.get("digest") != _digest(tensors):
+        raise ValueError(f"{path}: the data was changed since it was written: its digest is another")
+    offsets, values, counts, domains = (tensors[name] for name in _DTYPES)
+    fits = (
+        offsets.dim() == values.dim() == 2
+        and offsets.shape == (len(values), 2)
+        and values.shape[1] in (1, 3)
+        and counts.shape == (len(domains) + 1,)
+        and domains.dim() == 1
+        and int(counts[0]) == 0
+        and int(counts[-1]) == len(values)
+        and bool((counts.diff() >= 0).all())
+        and bool((domains < len(DOMAINS)).all())
+        and bool(values.isfinite().all())
+    )
+    if not fits:
+        raise ValueError(f"{path}: expected a bank of PSFs, but its tensors do not fit each other")

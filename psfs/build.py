@@ -1,0 +1,173 @@
+"""Building a bank: every sample of a model, on several processors, to be taken up again where it was left."""
+
+import json
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.model import PsfModel
+from torchbokeh.psfs.refit import Sparse, reconstruction
+from torchbokeh.psfs.represent import Represented, Target, represent
+from torchbokeh.psfs.similarity import neighbourhood, score
+
+TARGET = Target()
+"""What is asked of every sample where nothing else is said."""
+
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Built:
+    """One sample and how good it is.
+
+    Attributes:
+        represented: its points.
+        support: pixels that its dense PSF covers.
+        ssim: see `torchbokeh.psfs.similarity.Score`, as the next two; 1, 1 and 0 where the points are exact.
+        ssim_frame: likewise.
+        l1: likewise.
+        seconds: that one processor took.
+    """
+
+    represented: Represented
+    support: int
+    ssim: float
+    ssim_frame: float
+    l1: float
+    seconds: float
+
+
+def build_sample(model: PsfModel, number: int, target: Target) -> Built:
+    """Pre-filter a sample over its box of the grid, and find the domain and the points for it.
+
+    The same on every machine but for rounding, and the same bits on one.
+    """
+    start = time.perf_counter()
+    psf = model.prefiltered(*model.grid.box(number))
+    found = represent(psf, model.symmetry, turns=model.turns, target=target)
+    rounded = Sparse(found.sparse.points, found.sparse.values.astype(np.float32).astype(np.float64))
+    ssim, ssim_frame, l1 = 1.0, 1.0, 0.0
+    if found.domain == "laplacian":
+        ssim, ssim_frame, l1 = score(psf, reconstruction(rounded, neighbourhood(psf)))
+    support = int((psf > 0).any(0).sum())
+    return Built(Represented(found.domain, rounded), support, ssim, ssim_frame, l1, time.perf_counter() - start)
+
+
+def build(
+    model: PsfModel, path: str | Path, *, target: Target = TARGET, workers: int = 1, progress: bool = False
+) -> PsfBank:
+    """Build the bank of a model and write it to a file.
+
+    Samples are kept in the folder ``path`` + ``".parts"`` as they are finished: what was interrupted goes on from
+    there. The folder is removed when the bank is whole.
+
+    Args:
+        model: one of `torchbokeh.psfs.MODELS`, or your own; it must pickle.
+        path: of the file.
+        target: what is asked of each sample.
+        workers: processes.
+        progress: show a bar.
+
+    Returns:
+        The bank. Its ``info`` holds the target, and for every sample what `Built` says of it.
+
+    Raises:
+        ValueError: ``workers`` is below 1.
+    """
+    if workers < 1:
+        raise ValueError(f"workers: expected at least 1, got {workers}")
+    path = Path(path)
+    parts = path.with_name(path.name + ".parts")
+    parts.mkdir(parents=True, exist_ok=True)
+    order = {"model": model.name, "settings": model.settings(), "target": target._asdict()}
+    _claim(parts, json.dumps(order, sort_keys=True))
+    count = len(model.grid)
+    missing = [k for k in range(count) if not _part(parts, k).is_file()]
+    work = _finished(model, missing, target, workers, parts)
+    if progress:
+        from tqdm import tqdm
+
+        work = tqdm(work, total=count, initial=count - len(missing), desc=model.name, unit="PSF")
+    for _ in work:
+        pass
+    samples = [_read(_part(parts, k)) for k in range(count)]
+    measured = [{k: v for k, v in asdict(s).items() if k != "represented"} for s in samples]
+    columns: dict[str, Any] = {
+        key: [round(row[key], 5) for row in measured] for key in ("support", "ssim", "ssim_frame", "l1")
+    }
+    bank = PsfBank(model, [s.represented for s in samples], {"target": target._asdict(), **columns})
+    bank.save(path)
+    shutil.rmtree(parts)
+    return bank
+
+
+def _claim(parts: Path, order: str) -> None:
+    """Forget parts that were built to another order."""
+    note = parts / "order.json"
+    if note.is_file() and note.read_text() == order:
+        return
+    for file in parts.glob("*.npz"):
+        file.unlink()
+    note.write_text(order)
+
+
+def _part(parts: Path, number: int) -> Path:
+    return parts / f"{number:05d}.npz"
+
+
+def _finished(model: PsfModel, numbers: list[int], target: Target, workers: int, parts: Path) -> Iterator[int]:
+    """Build samples, largest first, and tell the number of each when it is written."""
+    jobs = [(model, k, target, _part(parts, k)) for k in reversed(numbers)]
+    if not jobs:
+        return
+    with _single_threads(), ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        running = [pool.submit(_job, *job) for job in jobs]
+        try:
+            for done in as_completed(running):
+                yield done.result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _single_threads() -> Iterator[None]:
+    """Workers that start meanwhile use one thread each, which also makes their sums the same on any machine's count."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _job(model: PsfModel, number: int, target: Target, path: Path) -> int:
+    found = build_sample(model, number, target)
+    points, values = found.represented.sparse
+    scores = [found.support, found.ssim, found.ssim_frame, found.l1, found.seconds]
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "wb") as file:
+        np.savez(file, domain=found.represented.domain, points=points, values=values, scores=np.array(scores))
+    os.replace(temporary, path)
+    return number
+
+
+def _read(path: Path) -> Built:
+    with np.load(path, allow_pickle=False) as file:
+        represented = Represented(str(file["domain"]), Sparse(file["points"], file["values"]))  # type: ignore[arg-type]
+        support, *scores = file["scores"].tolist()
+    return Built(represented, int(support), *scores)

@@ -1,0 +1,150 @@
+"""`Combined`: a disc in linear motion, in closed form (LKS table 1)."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.psfs.model import PREFILTER_NODES, Axis, Labels, Place, PsfModel, scaled, turned
+
+CELLS = 160
+"""Boxes of the finest level along each axis."""
+
+STILL = (0.5, 1.5)
+"""Lengths of a motion in px between which a disc passes into a sample of the bank."""
+
+ROWS = (8, 32)
+"""Least and most rows of the quadrature across a pixel; small discs need more."""
+
+
+def capsule(radius: float, length: float) -> NDArray[np.float64]:
+    """A disc, spread along a segment of the x axis: the light of every pixel, ``(1, h, w)``, with a sum of 1.
+
+    At height y the disc has a chord of half-width ``h = sqrt(r**2 - y**2)``. What reaches x is the overlap of that
+    chord with the interval ``[x - l/2, x + l/2]``: a trapezoid, whose integral over the pixel is closed; the rows of a
+    pixel are summed by Gauss quadrature between the ends of the disc.
+
+    Args:
+        radius: of the disc in px, >= 0. At 0 it is a line of no width.
+        length: of the segment in px, >= 0.
+    """
+    half = length / 2
+    # A disc below this radius lies within its pixel, and a line of no width would have no rows to sum.
+    radius = max(radius, 1e-3)
+    height, width = math.ceil(radius - 0.5), math.ceil(radius + half - 0.5)
+    nodes, weights = np.polynomial.legendre.leggauss(int(np.clip(256 / radius, *ROWS)))
+    rows = np.arange(height + 1)
+    # In the angle of a point of the rim the chord is smooth up to the ends of the disc.
+    low, high = (np.arcsin(np.clip(y / radius, -1.0, 1.0)) for y in (rows - 0.5, rows + 0.5))
+    angle = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * nodes
+    chord = np.asarray(radius * np.cos(angle), np.float64)
+    share = (high - low)[:, None] / 2 * weights * chord
+    edges = np.linspace(-0.5, width + 0.5, width + 2)
+    sums = _running(edges[None, None], chord[..., None], half)
+    quarter = np.maximum((share[:, None] @ np.diff(sums, axis=2))[:, 0], 0.0)
+    half_plane = np.concatenate([quarter[:, :0:-1], quarter], 1)
+    whole = np.concatenate([half_plane[:0:-1], half_plane])[None]
+    return whole / whole.sum()  # pi r**2, but for 1e-7 of the quadrature
+
+
+def _running(x: NDArray[np.float64], chord: NDArray[np.float64], half: float) -> NDArray[np.float64]:
+    """Integral over x, from the centre on, of the overlap of a chord with a segment about x, per length of it."""
+    if half < 1e-3:  # the ramps would cancel; what is left out is of the order of half squared
+        return np.clip(x, -chord, chord)
+    # The overlap is a second difference of ramps: |x + a| with a = +-(chord + half), +-(chord - half).
+    outer, inner = chord + half, chord - half
+
+    def ramp(u: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.abs(u) * u / 2
+
+    return (ramp(x + outer) + ramp(x - outer) - ramp(x + inner) - ramp(x - inner)) / (4 * half)
+
+
+class Combined(PsfModel):
+    """Defocus and linear motion in one PSF: a disc along a segment, turned to the motion of its pixel.
+
+    Coordinates are the CoC radius beyond half a pixel, below which a disc lies within its pixel, and the length of the
+    motion over the open shutter, both in px. The PSF is that of a shutter whose middle is the moment of the picture.
+    Longer motion is put together from segments, and larger discs are scaled from the largest.
+
+    Args:
+        radius: largest radius that is sampled.
+        length: longest motion that is sampled.
+
+    Example:
+        >>> model = Combined()
+        >>> psf = model.dense((4.5, 20.0))
+        >>> psf.shape, psf.sum().round(6).item()
+        ((1, 11, 31), 1.0)
+    """
+
+    name = "combined"
+    symmetry = "quadrants"
+    turns = True
+
+    def __init__(self, radius: float = 100.0, length: float = 256.0) -> None:
+        self.axes = (
+            Axis("radius", "px", radius - MIN_RADIUS, 2.0, CELLS),
+            Axis("motion length", "px", length, 1.0, CELLS),
+        )
+
+    def settings(self) -> dict[str, float | int | str]:
+        """The largest radius and length."""
+        return {"radius": self.axes[0].bound + MIN_RADIUS, "length": self.axes[1].bound}
+
+    def dense(self, coordinates: Sequence[float]) -> NDArray[np.float64]:
+        """`capsule` of a radius and a length."""
+        radius, length = coordinates
+        return capsule(radius + MIN_RADIUS, length)
+
+    def nodes(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
+        """So many that the ends of the discs and of the segments come at steps of less than a pixel."""
+        (r0, l0), (r1, l1) = low, high
+        return [max(PREFILTER_NODES, math.ceil(1.5 * (r1 - r0))), max(PREFILTER_NODES, math.ceil(l1 - l0) // 2)]
+
+    def place(self, labels: Labels) -> Place:
+        """Radius and length of every pixel, and its rotation; needs ``coc`` and ``motion``."""
+        if labels.coc is None or labels.motion is None:
+            raise ValueError(
+                f"{self.name}: expected coc and motion, got no " + ("coc" if labels.coc is None else "motion")
+            )
+        length = labels.motion.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+        return of_radius(self, labels.coc.abs(), length, frame=turned(labels.motion))
+
+    def still(self, labels: Labels) -> Tensor | None:
+        """What does not move is a disc; between the lengths of `STILL`, it is partly one."""
+        if labels.motion is None:
+            return None
+        start, stop = STILL
+        length = labels.motion.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+        return ((stop - length) / (stop - start)).clamp(0, 1)
+
+    def places(self, labels: Labels, size: int = 1) -> list[Place]:
+        """One PSF, or several in a row where the motion is longer than what is sampled."""
+        if labels.coc is None or labels.motion is None:
+            return [self.place(labels)]
+        coc, motion = labels.coc / size, labels.motion / size
+        length = motion.detach().square().sum(1, keepdim=True).sqrt()
+        longest = self.axes[1].bound * (coc.detach().abs() / (self.axes[0].bound + MIN_RADIUS)).clamp_min(1.0)
+        count = (length / longest).ceil().clamp_min(1.0)
+        most = int(count.max()) if count.numel() else 1
+        piece = self.place(Labels(coc=coc, motion=motion / count))
+        if most == 1:
+            return [piece]
+        found = []
+        for number in range(most):
+            step = (number + 0.5) / count - 0.5
+            found.append(piece._replace(offset=step * motion, share=(number < count) / count))
+        return found
+
+
+def of_radius(model: PsfModel, radius: Tensor, *lengths: Tensor, frame: Tensor | None = None) -> Place:
+    """The place of a radius and other lengths, in px; a radius beyond the largest is reached by scaling the PSF."""
+    scale = (radius.detach() / (model.axes[0].bound + MIN_RADIUS)).clamp_min(1.0)
+    first = (radius / scale - MIN_RADIUS).clamp_min(0.0)
+    place = Place(torch.cat([first, *(t / scale for t in lengths)], 1), frame)
+    return scaled(place, scale) if bool((scale > 1).any()) else place

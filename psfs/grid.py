@@ -1,0 +1,183 @@
+"""Where the samples of a space of PSFs stand: power remapping and the nested grid (LKS section 5.2).
+
+A coordinate of a PSF model runs from 0 up to a bound, and small ones need more samples than large ones. Two things see
+to that. The *power remapping* ``u = N (s / bound) ** (1 / beta)`` takes it to ``[0, N]``: with ``beta`` above 1, small
+coordinates are spread. (LKS writes ``s ** beta``, which would crowd them; the text says they get the higher
+resolution.) The *nested grid* then covers ``[0, N_1] x [0, N_2] x ...`` with boxes whose edges grow with the smallest
+of the coordinates: level l = 0, 1, 2, ... begins where that reaches the triangular number ``l (l+1) / 2``, and its
+boxes have edges of ``l + 1``, or what is left of them at the upper border. In one dimension that is one box per level.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import product
+
+import torch
+from torch import Tensor
+
+
+def triangular_root(x: Tensor) -> Tensor:
+    """The largest integer l with ``l (l+1) / 2 <= x``, for x >= 0, exact for whole numbers up to 2**40."""
+    return ((8 * x.double().floor() + 1).sqrt().sub(1) / 2).floor().long()
+
+
+class NestedGrid:
+    """Boxes that cover a space of PSF coordinates, found in constant time.
+
+    Args:
+        bounds: upper bound of every coordinate; the lower one is 0.
+        betas: exponents of the power remapping; above 1, small coordinates are sampled more finely.
+        cells: ``N`` of every coordinate: how many boxes of level 0 lie side by side.
+
+    Raises:
+        ValueError: the numbers of entries differ, or an entry is not above 0.
+
+    Example:
+        >>> grid = NestedGrid((1.0, 1.0), (1.0, 1.0), (9, 9))
+        >>> len(grid)
+        28
+        >>> grid.box(27)
+        ((0.6666666666666666, 0.6666666666666666), (1.0, 1.0))
+        >>> grid.index(torch.tensor([[0.5, 0.99], [0.0, 0.0]]))
+        tensor([25,  0])
+    """
+
+    def __init__(self, bounds: Sequence[float], betas: Sequence[float], cells: Sequence[int]) -> None:
+        for name, given in (("betas", betas), ("cells", cells)):
+            if len(given) != len(bounds):
+                raise ValueError(f"{name}: expected {len(bounds)} entries like bounds, got {len(given)}")
+        for name, given in (("bounds", bounds), ("betas", betas), ("cells", cells)):
+            if not given or not all(0 < value < math.inf for value in given):
+                raise ValueError(f"{name}: expected finite numbers above 0, got {tuple(given)}")
+        if any(n != int(n) for n in cells):
+            raise ValueError(f"cells: expected whole numbers, got {tuple(cells)}")
+        self.bounds = tuple(float(b) for b in bounds)
+        self.betas = tuple(float(b) for b in betas)
+        self.cells = tuple(int(n) for n in cells)
+        least = min(self.cells)
+        starts = [level * (level + 1) // 2 for level in range(int(triangular_root(torch.tensor(least - 1))) + 1)]
+        self._counts = [[-(-(n - start) // (level + 1)) for n in self.cells] for level, start in enumerate(starts)]
+        sizes = [math.prod(m) - math.prod(k - 1 for k in m) for m in self._counts]
+        self._first = [sum(sizes[:level]) for level in range(len(sizes) + 1)]
+
+    def __len__(self) -> int:
+        """The number of boxes."""
+        return self._first[-1]
+
+    def remap(self, coordinates: Tensor) -> Tensor:
+        """Coordinates ``(..., n)`` to grid units ``[0, N]``; what lies outside the bounds goes to their border."""
+        share = coordinates.double() / torch.tensor(self.bounds, dtype=torch.float64, device=coordinates.device)
+        powers = torch.tensor(self.betas, dtype=torch.float64, device=coordinates.device).reciprocal()
+        scale = torch.tensor(self.cells, dtype=torch.float64, device=coordinates.device)
+        return share.clamp(0, 1) ** powers * scale
+
+    def unmap(self, place: Tensor) -> Tensor:
+        """The inverse of `remap`, within the bounds."""
+        share = place.double() / torch.tensor(self.cells, dtype=torch.float64, device=place.device)
+        powers = torch.tensor(self.betas, dtype=torch.float64, device=place.device)
+        return share**powers * torch.tensor(self.bounds, dtype=torch.float64, device=place.device)
+
+    def index(self, coordinates: Tensor) -> Tensor:
+        """The number ``(...)`` of the box that holds coordinates ``(..., n)``, int64: the forward mapping g of LKS."""
+        if coordinates.shape[-1:] != (len(self.bounds),):
+            raise ValueError(f"coordinates: expected shape (..., {len(self.bounds)}), got {tuple(coordinates.shape)}")
+        return self._at(self.remap(coordinates))
+
+    def _at(self, place: Tensor) -> Tensor:
+        """The box that holds a place ``(..., n)`` in grid units."""
+        device = place.device
+        place = torch.minimum(place.clamp_min(0), self._inside(device))
+        level = triangular_root(place.amin(-1))
+        inner = ((place - (level * (level + 1) // 2)[..., None]) / (level + 1)[..., None]).floor().long()
+        # Boxes of a level have an index of 0 along some axis: first those that have it along axis 0, all others being
+        # free; then those that have not, but along axis 1; and so on.
+        counts = torch.tensor(self._counts, device=device)[level]
+        found = torch.tensor(self._first, device=device)[level]
+        before = torch.zeros_like(level)
+        settled = torch.zeros_like(level, dtype=torch.bool)
+        axes = range(len(self.cells))
+        for axis in axes:
+            rank, group = torch.zeros_like(level), torch.ones_like(level)
+            for other in axes:
+                if other == axis:
+                    continue
+                free = counts[..., other] - int(other < axis)
+                rank = rank * free + inner[..., other] - int(other < axis)
+                group = group * free
+            here = ~settled & (inner[..., axis] == 0)
+            found = found + torch.where(here, before + rank, 0)
+            settled = settled | here
+            before = before + group
+        return found
+
+    def neighbours(self, coordinates: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """The ``2**n`` boxes that linear interpolation takes, with their shares.
+
+        Along each axis, the other box is the one across the nearer face, and the share of both follows from the
+        distance of their middles. Shares are differentiable to the coordinates, sum to 1, and within a level change
+        without a jump; where boxes of different levels meet they need not.
+
+        Args:
+            coordinates: ``(..., n)``.
+
+        Returns:
+            Pairs of numbers ``(...)`` and shares ``(...)``, float64.
+        """
+        place = torch.minimum(self.remap(coordinates), self._inside(coordinates.device))
+        own = self._at(place.detach())
+        corners = torch.tensor(self.boxes(), dtype=torch.float64, device=coordinates.device)
+        low, high = corners[own].unbind(-2)
+        middle, half = (low + high) / 2, (high - low) / 2
+        inside = place.detach()
+        forward = torch.where(inside >= middle, 1.0, -1.0)
+        beyond = torch.where(forward > 0, high, low - 1e-9)
+        edge = self._inside(coordinates.device)
+        there = (beyond >= 0) & (beyond <= edge)
+        shares = []
+        for axis in range(len(self.cells)):
+            step = inside.clone()
+            step[..., axis] = beyond[..., axis].clamp(min=0)
+            other = corners[self._at(torch.minimum(step, edge))][..., axis]
+            gap = half[..., axis] + (other[..., 1] - other[..., 0]) / 2
+            far = (place[..., axis] - middle[..., axis]).abs() / gap
+            shares.append(torch.where(there[..., axis], far, 0.0))
+        found = []
+        for picked in product((False, True), repeat=len(self.cells)):
+            step, weight = inside.clone(), torch.ones_like(place[..., 0])
+            for axis, taken in enumerate(picked):
+                weight = weight * (shares[axis] if taken else 1 - shares[axis])
+                if taken:
+                    step[..., axis] = torch.where(there[..., axis], beyond[..., axis], inside[..., axis])
+            found.append((self._at(step), weight))
+        return found
+
+    def _inside(self, device: torch.device) -> Tensor:
+        """The largest place that lies within the grid."""
+        return torch.tensor(self.cells, dtype=torch.float64, device=device) * (1 - 2.0**-52)
+
+    def boxes(self) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+        """Lower and upper corner of every box in grid units, in order: the list that LKS stores."""
+        found = []
+        axes = range(len(self.cells))
+        for level, counts in enumerate(self._counts):
+            start, edge = level * (level + 1) // 2, level + 1
+            for axis in axes:
+                ranges = [range(other < axis, counts[other]) if other != axis else range(1) for other in axes]
+                for place in product(*ranges):
+                    low = tuple(start + edge * k for k in place)
+                    high = tuple(min(a + edge, n) for a, n in zip(low, self.cells, strict=True))
+                    found.append((low, high))
+        return found
+
+    def box(self, number: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of a box in coordinates: the backward mapping of LKS."""
+        if not 0 <= number < len(self):
+            raise ValueError(f"number: expected 0 to {len(self) - 1}, got {number}")
+        low, high = self.boxes()[number]
+        corners = self.unmap(torch.tensor([low, high], dtype=torch.float64)).tolist()
+        return tuple(corners[0]), tuple(corners[1])
+
+    def centres(self) -> Tensor:
+        """The middle ``(K, n)`` of every box, taken in grid units, as coordinates."""
+        corners = torch.tensor(self.boxes(), dtype=torch.float64)
+        return self.unmap(corners.mean(1))

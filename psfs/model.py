@@ -1,0 +1,191 @@
+"""What a model of point-spread functions is: a space of coordinates, a dense PSF for each, and its symmetry."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import ClassVar, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchbokeh.psfs.grid import NestedGrid
+
+Symmetry = Literal["none", "mirror", "quadrants", "octants"]
+"""Which reflections leave every PSF of a model as it is: none; y; x and y; x, y and the diagonal."""
+
+FRAME = 513
+"""Side of the picture in px that every dense PSF fits into, its centre being the middle pixel. LKS: 512."""
+
+PREFILTER_NODES = 3
+"""Nodes of the quadrature over a cell, along each coordinate, where a model does not say otherwise."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One coordinate of a model.
+
+    Attributes:
+        name: such as ``"radius"``.
+        unit: such as ``"px"``.
+        bound: its largest value; the smallest is 0.
+        beta: exponent of the power remapping, see `NestedGrid`.
+        cells: how finely it is sampled, see `NestedGrid`.
+    """
+
+    name: str
+    unit: str
+    bound: float
+    beta: float
+    cells: int
+
+
+class Labels(NamedTuple):
+    """What a renderer knows of each pixel. Maps that it does not have are None.
+
+    Attributes:
+        coc: ``(B, 1, H, W)`` signed CoC radius in px.
+        depth: ``(B, 1, H, W)`` metres along the optical axis.
+        motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter.
+    """
+
+    coc: Tensor | None = None
+    depth: Tensor | None = None
+    motion: Tensor | None = None
+
+
+class Place(NamedTuple):
+    """Which PSF of a model each pixel takes, and where it goes.
+
+    Attributes:
+        coordinates: ``(B, n, H, W)``.
+        frame: ``(B, 2, 2, H, W)``: the matrix that takes offsets of the PSF to offsets in the picture, a rotation
+            times a scale; None where that is the identity everywhere.
+        scale: ``(B, 1, H, W)`` of ``frame``; None where it is 1 everywhere.
+        offset: ``(B, 2, H, W)`` of the centre of the PSF from the pixel, (dx, dy) in px; None where it is 0 everywhere.
+        share: ``(B, 1, H, W)`` of the pixel's light that this PSF gets; None where it is all of it.
+    """
+
+    coordinates: Tensor
+    frame: Tensor | None = None
+    scale: Tensor | None = None
+    offset: Tensor | None = None
+    share: Tensor | None = None
+
+
+class PsfModel(ABC):
+    """Base class of PSF models: to add one, write `dense` and `place`, and what describes it.
+
+    Attributes:
+        name: of the model, in files and tables.
+        axes: its coordinates.
+        channels: 1, or 3 where the PSF is coloured.
+        symmetry: of every dense PSF.
+        turns: whether a renderer turns the PSF, so that only rotation-invariant domains will do.
+        merges: whether the PSF is smooth over a part of the CoC radius, so that pixels may be merged by that radius.
+        tints: whether channels of the PSF do not sum to 1 and are meant not to: white then comes out coloured.
+    """
+
+    name: ClassVar[str]
+    axes: tuple[Axis, ...]
+    channels: ClassVar[Literal[1, 3]] = 1
+    symmetry: ClassVar[Symmetry] = "none"
+    turns: ClassVar[bool] = False
+    merges: ClassVar[bool] = True
+    tints: ClassVar[bool] = False
+
+    @cached_property
+    def grid(self) -> NestedGrid:
+        """Where the samples stand."""
+        return NestedGrid([a.bound for a in self.axes], [a.beta for a in self.axes], [a.cells for a in self.axes])
+
+    @abstractmethod
+    def dense(self, coordinates: Sequence[float]) -> NDArray[np.float64]:
+        """The PSF at a coordinate: ``(channels, h, w)``, odd sizes of at most `FRAME`, centred, >= 0.
+
+        The light of each pixel, so that a channel sums to what arrives of it: 1 where nothing is lost.
+        """
+
+    @abstractmethod
+    def place(self, labels: Labels) -> Place:
+        """Which PSF each pixel of a picture takes. Differentiable to the labels.
+
+        Raises:
+            ValueError: a map that the model needs is None.
+        """
+
+    def places(self, labels: Labels, size: int = 1) -> list[Place]:
+        """The PSFs of each pixel of a picture whose pixels are blocks of ``size`` px; their sum is what it spreads.
+
+        The labels are in px. In blocks, the PSF is the same seen from farther away; models whose coordinates are
+        lengths take another sample instead.
+        """
+        place = self.place(labels)
+        return [place if size == 1 else scaled(place, 1 / size)]
+
+    def still(self, labels: Labels) -> Tensor | None:
+        """Share ``(B, 1, H, W)`` of each pixel's light that spreads over a plain disc; None where that is none of it.
+
+        Discs are splatted by rows, in closed form; the samples of the bank get the rest.
+        """
+        return None
+
+    def settings(self) -> dict[str, float | int | str]:
+        """What `torchbokeh.psfs.models.model_from` needs to build the model again; it stands in the file of a bank."""
+        return {}
+
+    def prefiltered(self, low: Sequence[float], high: Sequence[float]) -> NDArray[np.float64]:
+        """The mean of `dense` over a box of coordinates (LKS section 5.4), with a Gaussian as its weight.
+
+        The Gaussian has a standard deviation of a quarter of the box.
+        """
+        rules = [_gaussian(a, b, n) for a, b, n in zip(low, high, self.nodes(low, high), strict=True)]
+        chosen = list(product(*rules))
+        pictures = [self.dense([x for x, _ in place]) for place in chosen]
+        return mean_picture(pictures, [math.prod(share for _, share in place) for place in chosen])
+
+    def nodes(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
+        """How many coordinates along each axis stand for a box."""
+        return [PREFILTER_NODES] * len(self.axes)
+
+
+def _gaussian(low: float, high: float, count: int) -> list[tuple[float, float]]:
+    """Nodes and weights of the mean over an interval, weighted by a Gaussian of a quarter of its width."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    weights = weights * np.exp(-2 * nodes**2)
+    return list(zip((low + high) / 2 + (high - low) / 2 * nodes, weights / weights.sum(), strict=True))
+
+
+def scaled(place: Place, factor: float | Tensor) -> Place:
+    """The same PSFs, larger by a factor, a number or ``(B, 1, H, W)``."""
+    scale = torch.ones_like(place.coordinates[:, :1]) if place.scale is None else place.scale
+    frame = place.frame
+    if frame is None:
+        one = torch.eye(2, dtype=scale.dtype, device=scale.device)[None, :, :, None, None]
+        frame = one.expand(len(scale), 2, 2, *scale.shape[2:])
+    wide = factor[:, None] if isinstance(factor, Tensor) else factor
+    offset = None if place.offset is None else place.offset * factor
+    return Place(place.coordinates, frame * wide, scale * factor, offset, place.share)
+
+
+def mean_picture(pictures: Sequence[NDArray[np.float64]], shares: Sequence[float]) -> NDArray[np.float64]:
+    """Weighted sum of centred pictures ``(C, h, w)`` of different odd sizes."""
+    height, width = (max(p.shape[axis] for p in pictures) for axis in (1, 2))
+    out = np.zeros((pictures[0].shape[0], height, width))
+    for picture, share in zip(pictures, shares, strict=True):
+        y, x = (height - picture.shape[1]) // 2, (width - picture.shape[2]) // 2
+        out[:, y : y + picture.shape[1], x : x + picture.shape[2]] += share * picture
+    return out
+
+
+def turned(motion: Tensor) -> Tensor:
+    """Rotations ``(B, 2, 2, H, W)`` that take the x axis to the direction of ``motion (B, 2, H, W)``, if it has one."""
+    length = motion.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+    still = length < 1e-5
+    ahead = motion.new_tensor([1.0, 0.0])[:, None, None]
+    x, y = torch.where(still, ahead, motion / length).unbind(1)
+    return torch.stack([torch.stack([x, -y], 1), torch.stack([y, x], 1)], 1)

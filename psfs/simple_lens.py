@@ -1,0 +1,50 @@
+"""`SimpleLens`: the disc of a thin lens (LKS table 1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.psfs.combined import capsule, of_radius
+from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel
+
+
+class SimpleLens(PsfModel):
+    """The disc of confusion of a thin lens. Its one coordinate is the CoC radius beyond half a pixel, in px.
+
+    Renderers splat discs by rows, in closed form and without a bank (`torchbokeh.ops.splat.splat_spans`); this model is
+    there for comparison with LKS. Larger discs are scaled from the largest.
+
+    Args:
+        radius: largest radius that is sampled, in px.
+
+    Example:
+        >>> psf = SimpleLens().dense((9.5,))
+        >>> psf.shape, (314.159 * psf[0, 10, 10]).round(3).item()
+        ((1, 21, 21), 1.0)
+    """
+
+    name = "simple-lens"
+    symmetry = "octants"
+
+    def __init__(self, radius: float = 100.0) -> None:
+        self.axes = (Axis("radius", "px", radius - MIN_RADIUS, 2.0, 100 * 101 // 2),)
+
+    def settings(self) -> dict[str, float | int | str]:
+        """The largest radius."""
+        return {"radius": self.axes[0].bound + MIN_RADIUS}
+
+    def dense(self, coordinates: Sequence[float]) -> NDArray[np.float64]:
+        """The light of a disc on every pixel."""
+        return capsule(coordinates[0] + MIN_RADIUS, 0.0)
+
+    def place(self, labels: Labels) -> Place:
+        """The radius of every pixel; needs ``coc``."""
+        if labels.coc is None:
+            raise ValueError(f"{self.name}: expected coc, got none")
+        return of_radius(self, labels.coc.abs())
+
+    def places(self, labels: Labels, size: int = 1) -> list[Place]:
+        """The disc in blocks is a smaller disc."""
+        return [self.place(labels if labels.coc is None else Labels(coc=labels.coc / size))]

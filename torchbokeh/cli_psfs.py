@@ -1,0 +1,107 @@
+"""The command ``torchbokeh psfs``: build banks of point-spread functions, look at them, tabulate them."""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+SHOWN = 8
+"""Samples on a contact sheet."""
+
+TILE = 160
+"""Pixels of one picture on a contact sheet."""
+
+
+def add_psfs(parser: argparse.ArgumentParser) -> None:
+    """Add the three subcommands to the parser of ``torchbokeh psfs``.
+
+    Example:
+        >>> parser = argparse.ArgumentParser()
+        >>> add_psfs(parser)
+        >>> parser.parse_args(["build", "combined", "--workers", "2"]).workers
+        2
+    """
+    from torchbokeh.psfs.models import MODELS
+
+    names = sorted(MODELS)
+    commands = parser.add_subparsers(metavar="ACTION", required=True)
+    build = commands.add_parser("build", help="compute the bank of a model", allow_abbrev=False)
+    build.description = "Run it again to go on after an interruption."
+    build.add_argument("model", choices=names, metavar="MODEL", help=", ".join(names))
+    build.add_argument("--out", type=Path, metavar="FILE", help="default: MODEL.safetensors")
+    build.add_argument("--workers", type=_whole, default=1, metavar="W", help="processes (default 1)")
+    build.add_argument("--ssim", type=_share, metavar="S", help="least similarity of a sample (default 0.97)")
+    build.set_defaults(run=_build)
+    show = commands.add_parser("show", help="draw a contact sheet", allow_abbrev=False)
+    show.add_argument("bank", metavar="BANK", help=f"a file, or one of {', '.join(names)}")
+    show.add_argument("-o", "--output", type=Path, metavar="OUT", help="PNG (default: MODEL.png)")
+    show.set_defaults(run=_show)
+    table = commands.add_parser("table", help="samples, size, sparsity and similarity of banks", allow_abbrev=False)
+    table.add_argument("banks", nargs="*", metavar="BANK", help="files or models (default: all that are installed)")
+    table.add_argument("--held-out", type=_whole, default=100, metavar="N", help="coordinates to test (default 100)")
+    table.set_defaults(run=_table)
+
+
+def _build(args: argparse.Namespace) -> None:
+    from torchbokeh.image_io import check_writable
+    from torchbokeh.psfs.build import build
+    from torchbokeh.psfs.models import model_from
+    from torchbokeh.psfs.represent import Target
+
+    path = args.out or Path(f"{args.model}.safetensors")
+    check_writable(path.with_suffix(".png"))
+    target = Target() if args.ssim is None else Target(ssim=args.ssim)
+    start = time.perf_counter()
+    bank = build(model_from(args.model), path, target=target, workers=args.workers, progress=True)
+    print(f"{path}: {len(bank)} samples, {path.stat().st_size / 1e6:.2f} MB, {time.perf_counter() - start:.0f} s")
+
+
+def _show(args: argparse.Namespace) -> None:
+    from torchbokeh.image_io import check_writable, write_image
+    from torchbokeh.psfs.bank import PsfBank
+    from torchbokeh.psfs.sheet import contact_sheet
+
+    bank = PsfBank.load(args.bank)
+    path = args.output or Path(f"{bank.model.name}.png")
+    check_writable(path)
+    write_image(path, contact_sheet(bank, SHOWN, TILE))
+    print(f"{path}: dense, Laplacian, points, reconstruction, 10 x error")
+
+
+def _table(args: argparse.Namespace) -> None:
+    from torchbokeh.psfs.bank import PsfBank, installed
+    from torchbokeh.psfs.table import LKS, held_out, sparsity
+    from torchbokeh.report.tables import table
+
+    rows = []
+    for source in args.banks or installed():
+        bank = PsfBank.load(source)
+        found = list(held_out(bank, args.held_out))
+        ssim, frame = (float(np.mean([getattr(f, name) for f in found])) for name in ("ssim", "ssim_frame"))
+        betas = ", ".join(f"{b:g}" for b in bank.model.grid.betas)
+        megabytes = sum(t.nbytes for t in bank.buffers()) / 1e6
+        mean = f"{100 * sparsity(bank).mean():.1f}"
+        theirs = LKS.get(bank.model.name)
+        there = ("-",) * 3 if theirs is None else (str(theirs[0]), f"{theirs[2]:.1f}", f"{theirs[3]:.1f}")
+        ours = (str(len(bank)), f"{megabytes:.2f}", mean)
+        beside = [cell for pair in zip(ours, there, strict=True) for cell in pair]
+        rows.append([f"`{bank.model.name}`", betas, *beside, f"{ssim:.3f}", f"{frame:.4f}"])
+    head = ["model", "beta", "samples", "LKS", "MB", "LKS", "sparsity %", "LKS", "SSIM near", "SSIM in the frame"]
+    print(table(head, rows))
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
+    return int(text)
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1:
+        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, got {text!r}")
+    return value
