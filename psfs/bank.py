@@ -5,6 +5,7 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,12 @@ class PsfBank(nn.Module):
         found = far.new_zeros(len(self))
         owner = torch.arange(len(self), device=far.device).repeat_interleave(self.counts.diff())
         return found.scatter_reduce(0, owner, far, "amax")
+
+    @cached_property
+    def extents(self) -> Tensor:
+        """`PsfModel.extent` of every sample, ``(K,)`` float64 on the CPU: 1 where the model has none."""
+        found = self.model.extent(self.model.grid.centres())
+        return torch.ones(len(self), dtype=torch.float64) if found is None else found
 
     def gains(self) -> Tensor:
         """What each sample sums to, ``(K, C)``: 1, but for the fit, unless the model tints.

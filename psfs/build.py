@@ -20,9 +20,6 @@ from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import Represented, Target, represent
 from torchbokeh.psfs.similarity import neighbourhood, score
 
-TARGET = Target()
-"""What is asked of every sample where nothing else is said."""
-
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -64,7 +61,7 @@ def build_sample(model: PsfModel, number: int, target: Target) -> Built:
 
 
 def build(
-    model: PsfModel, path: str | Path, *, target: Target = TARGET, workers: int = 1, progress: bool = False
+    model: PsfModel, path: str | Path, *, target: Target | None = None, workers: int = 1, progress: bool = False
 ) -> PsfBank:
     """Build the bank of a model and write it to a file.
 
@@ -74,7 +71,7 @@ def build(
     Args:
         model: one of `torchbokeh.psfs.MODELS`, or your own; it must pickle.
         path: of the file.
-        target: what is asked of each sample.
+        target: what is asked of each sample; None for the similarity that the model names.
         workers: processes.
         progress: show a bar.
 
@@ -86,6 +83,7 @@ def build(
     """
     if workers < 1:
         raise ValueError(f"workers: expected at least 1, got {workers}")
+    target = Target(ssim=model.similarity) if target is None else target
     path = Path(path)
     parts = path.with_name(path.name + ".parts")
     parts.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 import torch
@@ -9,10 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.psfs.model import PREFILTER_NODES, Axis, Labels, Place, PsfModel, scaled, turned
+from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel, gaussian, mean_picture, scaled, turned
+
+NODES = 5
+"""Radii, and lengths, whose mean stands for a box of the grid."""
 
 CELLS = 160
 """Boxes of the finest level along each axis."""
+
+SHARING = 2 / 3
+"""What sharing turned points among four pixels adds to the square of a radius: 4 times its mean variance, 1/6."""
 
 STILL = (0.5, 1.5)
 """Lengths of a motion in px between which a disc passes into a sample of the bank."""
@@ -48,6 +55,7 @@ def capsule(radius: float, length: float) -> NDArray[np.float64]:
     quarter = np.maximum((share[:, None] @ np.diff(sums, axis=2))[:, 0], 0.0)
     half_plane = np.concatenate([quarter[:, :0:-1], quarter], 1)
     whole = np.concatenate([half_plane[:0:-1], half_plane])[None]
+    whole[whole < 1e-12 * whole.max()] = 0.0  # what rounding left outside
     return whole / whole.sum()  # pi r**2, but for 1e-7 of the quadrature
 
 
@@ -101,19 +109,32 @@ class Combined(PsfModel):
         radius, length = coordinates
         return capsule(radius + MIN_RADIUS, length)
 
-    def nodes(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
-        """So many that the ends of the discs and of the segments come at steps of less than a pixel."""
-        (r0, l0), (r1, l1) = low, high
-        return [max(PREFILTER_NODES, math.ceil(1.5 * (r1 - r0))), max(PREFILTER_NODES, math.ceil(l1 - l0) // 2)]
+    def extent(self, coordinates: Tensor) -> Tensor:
+        """Four times the standard deviation of the PSF along the motion: without motion, twice the radius."""
+        radius, length = (coordinates[..., 0] + MIN_RADIUS), coordinates[..., 1]
+        return (4 * radius.square() + 4 / 3 * length.square()).sqrt()
+
+    def prefiltered(self, low: Sequence[float], high: Sequence[float]) -> NDArray[np.float64]:
+        """The mean over a box, of PSFs that are scaled to the extent of its middle: as renderers scale the sample."""
+        corners = torch.tensor([low, high], dtype=torch.float64)
+        middle = float(self.extent(self.grid.unmap(self.grid.remap(corners).mean(0))))
+        pictures, shares = [], []
+        for (radius, a), (length, b) in product(*(gaussian(x, y, NODES) for x, y in zip(low, high, strict=True))):
+            factor = middle / float(self.extent(torch.tensor([radius, length], dtype=torch.float64)))
+            pictures.append(capsule((radius + MIN_RADIUS) * factor, length * factor))
+            shares.append(a * b)
+        return mean_picture(pictures, shares)
 
     def place(self, labels: Labels) -> Place:
-        """Radius and length of every pixel, and its rotation; needs ``coc`` and ``motion``."""
+        """Radius (less `SHARING`), length and rotation of every pixel; needs ``coc`` and ``motion``."""
         if labels.coc is None or labels.motion is None:
             raise ValueError(
                 f"{self.name}: expected coc and motion, got no " + ("coc" if labels.coc is None else "motion")
             )
         length = labels.motion.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
-        return of_radius(self, labels.coc.abs(), length, frame=turned(labels.motion))
+        oblique = labels.motion.abs().amin(1, keepdim=True).clamp(max=1)  # along an axis, rows fall on rows
+        radius = (labels.coc.square() - SHARING * oblique).clamp_min(MIN_RADIUS**2).sqrt()
+        return of_radius(self, radius, length, frame=turned(labels.motion))
 
     def still(self, labels: Labels) -> Tensor | None:
         """What does not move is a disc; between the lengths of `STILL`, it is partly one."""

@@ -22,7 +22,7 @@ FRAME = 513
 """Side of the picture in px that every dense PSF fits into, its centre being the middle pixel. LKS: 512."""
 
 PREFILTER_NODES = 3
-"""Nodes of the quadrature over a cell, along each coordinate, where a model does not say otherwise."""
+"""Nodes of the quadrature over a cell, along each coordinate."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ class PsfModel(ABC):
         turns: whether a renderer turns the PSF, so that only rotation-invariant domains will do.
         merges: whether the PSF is smooth over a part of the CoC radius, so that pixels may be merged by that radius.
         tints: whether channels of the PSF do not sum to 1 and are meant not to: white then comes out coloured.
+        similarity: what a bank of it is built to, see `torchbokeh.psfs.represent.Target`.
     """
 
     name: ClassVar[str]
@@ -97,6 +98,7 @@ class PsfModel(ABC):
     turns: ClassVar[bool] = False
     merges: ClassVar[bool] = True
     tints: ClassVar[bool] = False
+    similarity: ClassVar[float] = 0.97
 
     @cached_property
     def grid(self) -> NestedGrid:
@@ -134,6 +136,14 @@ class PsfModel(ABC):
         """
         return None
 
+    def extent(self, coordinates: Tensor) -> Tensor | None:
+        """How large the PSFs at coordinates ``(..., n)`` are, ``(...)`` > 0, where the nearest sample is to be scaled.
+
+        A sample that stands for another coordinate is then drawn larger or smaller by the ratio of their extents, so
+        that only its shape is the nearest there is. None: samples are drawn as they are.
+        """
+        return None
+
     def settings(self) -> dict[str, float | int | str]:
         """What `torchbokeh.psfs.models.model_from` needs to build the model again; it stands in the file of a bank."""
         return {}
@@ -143,17 +153,13 @@ class PsfModel(ABC):
 
         The Gaussian has a standard deviation of a quarter of the box.
         """
-        rules = [_gaussian(a, b, n) for a, b, n in zip(low, high, self.nodes(low, high), strict=True)]
+        rules = [gaussian(a, b, PREFILTER_NODES) for a, b in zip(low, high, strict=True)]
         chosen = list(product(*rules))
         pictures = [self.dense([x for x, _ in place]) for place in chosen]
         return mean_picture(pictures, [math.prod(share for _, share in place) for place in chosen])
 
-    def nodes(self, low: Sequence[float], high: Sequence[float]) -> list[int]:
-        """How many coordinates along each axis stand for a box."""
-        return [PREFILTER_NODES] * len(self.axes)
 
-
-def _gaussian(low: float, high: float, count: int) -> list[tuple[float, float]]:
+def gaussian(low: float, high: float, count: int) -> list[tuple[float, float]]:
     """Nodes and weights of the mean over an interval, weighted by a Gaussian of a quarter of its width."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     weights = weights * np.exp(-2 * nodes**2)

@@ -184,6 +184,7 @@ class PhysicalLens(PsfModel):
 
     name = "physical-lens"
     channels = 3
+    similarity = 0.985
     symmetry = "mirror"
     turns = True
 

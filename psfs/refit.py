@@ -248,13 +248,21 @@ def fewest(fit: Fit, good: Callable[[Sparse], bool]) -> Sparse:
     return fit.sparse(chosen)
 
 
+def drawn(sparse: Sparse, reach: tuple[int, int]) -> Array:
+    """The points in a picture ``(C, 2 ry + 1, 2 rx + 1)`` that holds them, by its reach; those that meet add up."""
+    reach_y, reach_x = reach
+    height, width = 2 * reach_y + 1, 2 * reach_x + 1
+    flat = (sparse.points[:, 1] + reach_y) * width + sparse.points[:, 0] + reach_x
+    planes = [np.bincount(flat, weights, height * width) for weights in sparse.values.T]
+    return np.stack(planes).astype(np.float64).reshape(-1, height, width)
+
+
 def reconstruction(sparse: Sparse, size: tuple[int, int]) -> Array:
     """What a sparse Laplacian integrates to: ``(C, h, w)``, odd sizes, centred; in free space, exactly."""
     height, width = size
-    reach_x, reach_y = np.maximum(np.abs(sparse.points).max(0, initial=0), (width // 2, height // 2))
-    buffer = np.zeros((sparse.values.shape[1], 2 * reach_y + 1, 2 * reach_x + 1))
-    x, y = sparse.points.T
-    buffer[:, y + reach_y, x + reach_x] = sparse.values.T
-    whole = poisson_fft(torch.from_numpy(buffer)[None], compact=False)[0].numpy()
+    far_x, far_y = np.abs(sparse.points).max(0, initial=0).tolist()
+    reach_y, reach_x = max(far_y, height // 2), max(far_x, width // 2)
+    buffer = torch.from_numpy(drawn(sparse, (reach_y, reach_x)))
+    whole = poisson_fft(buffer[None], compact=False)[0].numpy()
     top, left = reach_y - height // 2, reach_x - width // 2
     return whole[:, top : top + height, left : left + width]

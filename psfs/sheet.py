@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 GAP = 4
 """Pixels between the pictures."""
 
+BRIGHT = 30.0
+"""What is more than so many times as bright as the median is shown as bright as that."""
+
 ERROR = 10.0
 """Factor of the error in the last column."""
 
@@ -23,8 +26,8 @@ def contact_sheet(bank: PsfBank, count: int, tile: int) -> Tensor:
     """Some samples, evenly chosen, one per row.
 
     Columns: the dense pre-filtered PSF; its Laplacian; the points that stand for it; what they integrate to; ten times
-    the difference. Each row has its own scale: white is the maximum of the PSF, and in the other columns red is
-    positive and blue negative.
+    the difference. Each row has its own scale: white is the maximum of the PSF (or `BRIGHT` times its median), and in the
+    other columns red is positive and blue negative.
 
     Args:
         bank: the bank.
@@ -49,7 +52,7 @@ def _pictures(bank: PsfBank, number: int) -> list[Array]:
     x, y = represented.sparse.points.T
     inside = (np.abs(x) <= size[1] // 2) & (np.abs(y) <= size[0] // 2)
     points[:, y[inside] + size[0] // 2, x[inside] + size[1] // 2] = represented.sparse.values[inside].T
-    top = dense.max()
+    top = _white_point(dense)
     return [
         _white(dense / top),
         _signed(centred(laplacian(psf), size)),
@@ -59,6 +62,11 @@ def _pictures(bank: PsfBank, number: int) -> list[Array]:
     ]
 
 
+def _white_point(picture: Array) -> float:
+    """The largest value, unless it outshines the rest, as the light in the middle of a glow does."""
+    return float(min(picture.max(), BRIGHT * np.median(picture[picture > 0])))
+
+
 def _white(picture: Array) -> Array:
     return np.broadcast_to(np.clip(picture, 0, 1), (3, *picture.shape[1:]))
 
@@ -66,7 +74,7 @@ def _white(picture: Array) -> Array:
 def _signed(picture: Array, top: float | None = None) -> Array:
     """Red above 0, blue below, square roots so that small values are seen."""
     mean = picture.mean(0)
-    strength = np.clip(np.abs(mean) / (top or np.abs(mean).max(initial=1e-300)), 0, 1) ** 0.5
+    strength = np.clip(np.abs(mean) / (top or _white_point(np.abs(mean))), 0, 1) ** 0.5
     return np.stack([np.where(mean > 0, strength, 0), 0.3 * strength, np.where(mean < 0, strength, 0)])
 
 

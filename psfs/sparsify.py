@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchbokeh.ops.integrate import poisson_fft
 from torchbokeh.psfs.refit import Array, Points, Sparse, reconstruction
 from torchbokeh.psfs.represent import laplacian as laplacian_of
 from torchbokeh.psfs.represent import nonzero
@@ -224,11 +222,9 @@ def anneal(points: Points, laplacian: Array, psf: Array, seed: int, *, steps: in
 
 
 def _error(sparse: Sparse, wanted: Array) -> float:
-    """Sum of absolute differences of the `reconstruction` from a picture, by one convolution for all points."""
-    painted = torch.zeros((1, *wanted.shape), dtype=torch.float64)
-    x, y = sparse.points.T + np.array([[wanted.shape[2] // 2], [wanted.shape[1] // 2]])
-    painted[0, :, y, x] = torch.from_numpy(sparse.values.T)
-    return float(np.abs(poisson_fft(painted, compact=False)[0].numpy() - wanted).sum())
+    """Sum of absolute differences of the `reconstruction` from a picture."""
+    height, width = wanted.shape[1:]
+    return float(np.abs(reconstruction(sparse, (height, width)) - wanted).sum())
 
 
 def sparsify(psf: Array, count: int, seed: int, *, relaxation: bool = True, annealing: bool = True) -> Sparse:

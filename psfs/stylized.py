@@ -121,6 +121,7 @@ class Stylized(PsfModel):
 
     name = "stylized"
     channels = 3
+    similarity = 0.99
     tints = True
 
     def __init__(self, mask: Mask | str | None = None, shift: float = 0.04, radius: float = 64.0) -> None:

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.refit import reconstruction
+from torchbokeh.psfs.refit import Sparse, drawn, reconstruction
 from torchbokeh.psfs.represent import Represented
 from torchbokeh.psfs.similarity import centred, neighbourhood, score
 
@@ -43,10 +43,23 @@ def integrated(represented: Represented, size: tuple[int, int]) -> Array:
     domain, sparse = represented
     if domain == "laplacian":
         return reconstruction(sparse, size)
-    reach = np.abs(sparse.points).max(initial=0) + 1
-    out = np.zeros((sparse.values.shape[1], 2 * reach + 1, 2 * reach + 1))
-    out[:, sparse.points[:, 1] + reach, sparse.points[:, 0] + reach] = sparse.values.T
+    reach = int(np.abs(sparse.points).max(initial=0)) + 1
+    out = drawn(sparse, (reach, reach))
     return centred(out.cumsum(2) if domain == "scanline" else out, size)
+
+
+def resized(represented: Represented, factor: float) -> Represented:
+    """A sample drawn larger by a factor, as `torchbokeh.ops.points.splat_points` draws it: shared by four pixels."""
+    if factor == 1:
+        return represented
+    domain, sparse = represented
+    place = sparse.points * factor
+    corner = np.floor(place).astype(np.int64)
+    x, y = (place - corner).T[..., None]
+    values = sparse.values / (factor**2 if domain == "laplacian" else 1.0)
+    shares = [(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y]
+    corners = [corner + step for step in np.array([[0, 0], [1, 0], [0, 1], [1, 1]])]
+    return Represented(domain, Sparse(np.concatenate(corners), np.concatenate([values * share for share in shares])))
 
 
 def held_out(bank: PsfBank, count: int, seed: int = 0) -> Iterator[HeldOut]:
@@ -61,7 +74,9 @@ def held_out(bank: PsfBank, count: int, seed: int = 0) -> Iterator[HeldOut]:
         place = torch.from_numpy(draw.uniform(low, high))
         coordinates = tuple(bank.model.grid.unmap(place).tolist())
         psf = bank.model.dense(coordinates)
-        found = score(psf, integrated(bank.sample(int(number)), neighbourhood(psf)))
+        extent = bank.model.extent(bank.model.grid.unmap(place))
+        factor = 1.0 if extent is None else float(extent / bank.extents[number])
+        found = score(psf, integrated(resized(bank.sample(int(number)), factor), neighbourhood(psf)))
         yield HeldOut(coordinates, found.ssim, found.ssim_frame)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.integrate import poisson_fft, running_sum_x
 from torchbokeh.ops.merge import Merging, merged
@@ -13,7 +14,7 @@ from torchbokeh.ops.points import splat_points
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.model import Labels, Place
+from torchbokeh.psfs.model import Labels, Place, scaled
 from torchbokeh.psfs.represent import DOMAINS, Domain
 
 _INTEGRALS: dict[Domain, Callable[[Tensor], Tensor]] = {
@@ -26,25 +27,70 @@ ROOM = 2
 """Pixels around the farthest points: what is shared with a neighbour, and the ring on which the picture vanishes."""
 
 
-def packed(labels: Labels) -> Tensor:
+def bank_labels(
+    bank: PsfBank, image: Tensor, coc: Tensor | None, depth: Tensor | None, motion: Tensor | None
+) -> Labels:
+    """Check a picture and its maps, and put the maps together.
+
+    Raises:
+        TypeError: one of them is not a floating-point tensor.
+        ValueError: a shape, device or value does not fit, or a map that the model needs is missing.
+    """
+    check_image("image", image, ("B", "C", "H", "W"))
+    b, channels, h, w = image.shape
+    for name, given, count in (("coc", coc, 1), ("depth", depth, 1), ("motion", motion, 2)):
+        if given is None:
+            continue
+        check_image(name, given, (b, count, h, w), like=image)
+        if torch.compiler.is_compiling() or given.numel() == 0:
+            continue
+        low, high = given.detach().aminmax()
+        if name == "depth" and not bool(low > 0):
+            raise ValueError(f"depth: expected values above 0 (inf is sky), got one of {low.item():g}")
+        if name != "depth" and not bool((high - low).isfinite()):
+            raise ValueError(f"{name}: expected finite values, got {int((~given.isfinite()).sum())} that are not")
+    colours = bank.values.shape[1]
+    if channels % colours:
+        raise ValueError(f"image: expected a multiple of {colours} channels for coloured PSFs, got {channels}")
+    labels = Labels(coc, depth, motion)
+    if image.numel():
+        corner = [None if t is None else t[:1, :, :1, :1].detach() for t in labels]
+        bank.model.place(Labels(*corner))  # says which map is missing
+    return labels
+
+
+def blur_with_bank(
+    image: Tensor, labels: Labels, bank: PsfBank, merging: Merging | None, highest: int, *, interpolate: bool
+) -> Tensor:
+    """`splat_bank` of a picture ``(B, C, H, W)`` and its coverage, the one divided by the other."""
+    count = bank.values.shape[1]
+    covered = torch.cat([image, torch.ones_like(image[:, :1]).expand(-1, count, -1, -1)], 1)
+    out = splat_bank(covered, labels, bank, merging, highest=highest, interpolate=interpolate)
+    return out[:, :-count] / out[:, -count:].clamp_min(TINY).repeat(1, image.shape[1] // count, 1, 1)
+
+
+def packed(labels: Labels, signed: bool = False) -> Tensor:
     """The maps of labels but for the CoC, ``(B, E, H, W)``, as channels that may be averaged.
 
     Motion becomes ``(dx dx, dx dy, dy dy)``: a PSF spreads along a line, so that opposite directions are the same.
+    Where they are not, ``signed``, it stays as it is.
     """
     maps = [] if labels.depth is None else [labels.depth.reciprocal()]
-    if labels.motion is not None:
+    if labels.motion is not None and signed:
+        maps.append(labels.motion)
+    elif labels.motion is not None:
         x, y = labels.motion.split(1, 1)
         maps += [x * x, x * y, y * y]
-    return torch.cat(maps, 1) if maps else _needed(labels)[:, :0]
+    return torch.cat(maps, 1) if maps else needed(labels)[:, :0]
 
 
-def unpacked(coc: Tensor, maps: Tensor, like: Labels) -> Labels:
+def unpacked(coc: Tensor, maps: Tensor, like: Labels, signed: bool = False) -> Labels:
     """Labels from averages of `packed`: of the same kinds as ``like``."""
     depth = motion = None
     if like.depth is not None:
         depth, maps = maps[:, :1].clamp_min(1e-12).reciprocal(), maps[:, 1:]
     if like.motion is not None:
-        motion = _along(*maps.split(1, 1))
+        motion = maps if signed else _along(*maps.split(1, 1))
     return Labels(coc, depth, motion)
 
 
@@ -63,6 +109,7 @@ def splat_bank(
     *,
     highest: int = 0,
     interpolate: bool = False,
+    advance: float = 0.0,
 ) -> Tensor:
     """Blur with the PSFs of a bank.
 
@@ -74,7 +121,9 @@ def splat_bank(
         merging: how far to merge by the radius of ``labels.coc``; ``None``: not at all.
         highest: the coarsest level, see `torchbokeh.ops.merge.highest_level`.
         interpolate: splat the neighbouring samples of the grid as well, by their share, instead of the nearest one
-            alone. Without it no gradient runs to the coordinates of the PSFs.
+            alone. Without it, gradients to the coordinates of the PSFs run through their size and direction only.
+        advance: by which part of its motion the centre of each PSF lies ahead of the pixel: 0 where the picture shows
+            the middle of the exposure, 0.5 where it shows the beginning.
 
     Returns:
         ``(B, C, H, W)``, not divided by the coverage.
@@ -83,27 +132,36 @@ def splat_bank(
         ValueError: the model needs another label.
     """
 
+    def places(now: Labels, size: int) -> list[Place]:
+        found = bank.model.places(now, size)
+        if not advance or now.motion is None:
+            return found
+        ahead = advance / size * now.motion
+        return [p._replace(offset=ahead if p.offset is None else p.offset + ahead) for p in found]
+
     def splat(cells: Tensor, radius: Tensor | None, now: Labels, size: int) -> Tensor:
         still = bank.model.still(now)
         if still is None or radius is None:
-            return _splat_places(cells, bank.model.places(now, size), bank, interpolate)
+            return _splat_places(cells, places(now, size), bank, interpolate)
         discs = splat_spans(cells * still, radius, Disc().profile(), integrate=True)
         moving = cells * (1 - still)
         if not bool((still < 1).any()):
             return discs
-        return discs + _splat_places(moving, bank.model.places(now, size), bank, interpolate)
+        return discs + _splat_places(moving, places(now, size), bank, interpolate)
 
     if merging is None or highest == 0:
         return splat(values, labels.coc, labels, 1)
-    coc, maps = _needed(labels), packed(labels)
+    signed = advance != 0
+    coc, maps = needed(labels), packed(labels, signed)
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
-        return splat(cells, radius, unpacked(radius * size, means, labels), size)
+        return splat(cells, radius, unpacked(radius * size, means, labels, signed), size)
 
     return merged(values, coc, splat_cells, merging, highest, labels=maps)
 
 
-def _needed(labels: Labels) -> Tensor:
+def needed(labels: Labels) -> Tensor:
+    """The CoC of labels that must have one."""
     if labels.coc is None:
         raise ValueError("labels.coc: expected one, since pixels are merged by it, got none")
     return labels.coc
@@ -113,12 +171,16 @@ def _splat_places(values: Tensor, places: Sequence[Place], bank: PsfBank, interp
     out = torch.zeros_like(values)
     for place in places:
         source = values if place.share is None else values * place.share
-        coordinates = place.coordinates.movedim(1, -1)
-        if not interpolate:
-            out = out + _splat_samples(source, bank.model.grid.index(coordinates)[:, None], place, bank)
-            continue
-        for number, share in bank.model.grid.neighbours(coordinates):
-            out = out + _splat_samples(source * share[:, None].to(source.dtype), number[:, None], place, bank)
+        grid, coordinates = bank.model.grid, place.coordinates.movedim(1, -1)
+        extent = bank.model.extent(coordinates)
+        chosen = grid.neighbours(coordinates) if interpolate else [(grid.index(coordinates), None)]
+        for number, share in chosen:
+            weighed = source if share is None else source * share[:, None].to(source.dtype)
+            drawn = place
+            if extent is not None:
+                ratio = extent / bank.extents.to(extent)[number]
+                drawn = scaled(place, ratio[:, None].to(source.dtype))._replace(offset=place.offset)
+            out = out + _splat_samples(weighed, number[:, None], drawn, bank)
     return out
 
 

@@ -1,7 +1,9 @@
-"""The command ``torchbokeh psfs``: build banks of point-spread functions, look at them, tabulate them."""
+"""The command ``torchbokeh psfs``: build banks of point-spread functions, look at them, tabulate and analyse them."""
 
 import argparse
+import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ TILE = 160
 
 
 def add_psfs(parser: argparse.ArgumentParser) -> None:
-    """Add the three subcommands to the parser of ``torchbokeh psfs``.
+    """Add the subcommands to the parser of ``torchbokeh psfs``.
 
     Example:
         >>> parser = argparse.ArgumentParser()
@@ -31,7 +33,7 @@ def add_psfs(parser: argparse.ArgumentParser) -> None:
     build.add_argument("model", choices=names, metavar="MODEL", help=", ".join(names))
     build.add_argument("--out", type=Path, metavar="FILE", help="default: MODEL.safetensors")
     build.add_argument("--workers", type=_whole, default=1, metavar="W", help="processes (default 1)")
-    build.add_argument("--ssim", type=_share, metavar="S", help="least similarity of a sample (default 0.97)")
+    build.add_argument("--ssim", type=_share, metavar="S", help="least similarity of a sample (default: the model's)")
     build.set_defaults(run=_build)
     show = commands.add_parser("show", help="draw a contact sheet", allow_abbrev=False)
     show.add_argument("bank", metavar="BANK", help=f"a file, or one of {', '.join(names)}")
@@ -41,6 +43,11 @@ def add_psfs(parser: argparse.ArgumentParser) -> None:
     table.add_argument("banks", nargs="*", metavar="BANK", help="files or models (default: all that are installed)")
     table.add_argument("--held-out", type=_whole, default=100, metavar="N", help="coordinates to test (default 100)")
     table.set_defaults(run=_table)
+    analyse = commands.add_parser("analyse", help="how well sparse PSFs do, in tables and plots", allow_abbrev=False)
+    analyse.description = "Repeats the analysis of LKS, section 7.3. Takes about four minutes."
+    analyse.add_argument("--out", type=Path, default=Path("out/psfs"), metavar="DIR", help="default: out/psfs")
+    analyse.add_argument("--quick", action="store_true", help="shows that everything runs, the numbers mean little")
+    analyse.set_defaults(run=_analyse)
 
 
 def _build(args: argparse.Namespace) -> None:
@@ -51,7 +58,7 @@ def _build(args: argparse.Namespace) -> None:
 
     path = args.out or Path(f"{args.model}.safetensors")
     check_writable(path.with_suffix(".png"))
-    target = Target() if args.ssim is None else Target(ssim=args.ssim)
+    target = None if args.ssim is None else Target(ssim=args.ssim)
     start = time.perf_counter()
     bank = build(model_from(args.model), path, target=target, workers=args.workers, progress=True)
     print(f"{path}: {len(bank)} samples, {path.stat().st_size / 1e6:.2f} MB, {time.perf_counter() - start:.0f} s")
@@ -89,6 +96,23 @@ def _table(args: argparse.Namespace) -> None:
         rows.append([f"`{bank.model.name}`", betas, *beside, f"{ssim:.3f}", f"{frame:.4f}"])
     head = ["model", "beta", "samples", "LKS", "MB", "LKS", "sparsity %", "LKS", "SSIM near", "SSIM in the frame"]
     print(table(head, rows))
+
+
+def _analyse(args: argparse.Namespace) -> None:
+    if find_spec("matplotlib") is None:
+        raise ValueError("the analysis draws plots with matplotlib: pip install torchbokeh[report]")
+    from torchbokeh.psf_analysis import Settings, analyse, quick
+    from torchbokeh.psf_tables import write_analysis
+    from torchbokeh.report.write import prepare
+
+    prepare(args.out)
+    start = time.perf_counter()
+
+    def say(line: str) -> None:
+        print(f"[{time.perf_counter() - start:4.0f} s] {line}", file=sys.stderr, flush=True)
+
+    for path in write_analysis(analyse(quick() if args.quick else Settings(), say), args.out):
+        print(path)
 
 
 def _whole(text: str) -> int:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc
-from torchbokeh.bank_splatting import splat_bank
+from torchbokeh.bank_splatting import bank_labels, blur_with_bank, needed
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.composite import TINY
@@ -71,6 +71,10 @@ class KernelSplatting(nn.Module):
         aperture: ``"disc"``, ``"N-gon"`` such as ``"6-gon"``, or a `torchbokeh.psfs.Aperture`.
         quality: ``"exact"``, ``"high"``, ``"balanced"`` or ``"fast"``; see `torchbokeh.quality.QUALITIES`.
         tolerance: relative L1 error to keep to, as far as it can be predicted; picks the quality instead.
+        bank: sparse PSFs of any model in the place of the aperture, see `torchbokeh.psfs.PsfBank`: every pixel takes
+            the sample that is nearest to its CoC, depth or motion.
+        interpolate: of a bank, take the neighbouring samples by their shares instead of the nearest one: nearer to the
+            model, and differentiable in all of its coordinates, for two (or four) times the time.
 
     Raises:
         TypeError: an argument of the wrong kind.
@@ -85,6 +89,13 @@ class KernelSplatting(nn.Module):
         >>> print(splatting.plan(image, coc))
         64 x 64 image, radius up to 20.0 px.
         Quality 'balanced': blocks of up to 4 x 4 pixels are merged; predicted relative error 0.019.
+
+        Defocus with motion:
+
+        >>> from torchbokeh.psfs import PsfBank
+        >>> splatting = KernelSplatting(bank=PsfBank.load("combined"))
+        >>> splatting(image, coc, motion=torch.full((1, 2, 64, 64), 12.0)).shape
+        torch.Size([1, 3, 64, 64])
     """
 
     def __init__(
@@ -113,14 +124,18 @@ class KernelSplatting(nn.Module):
         return f"quality={self.quality!r}" if self.tolerance is None else f"tolerance={self.tolerance}"
 
     def plan(
-        self, image: Tensor, coc: Tensor, *, depth: Tensor | None = None, motion: Tensor | None = None
+        self,
+        image: Tensor,
+        coc: Tensor | None = None,
+        *,
+        depth: Tensor | None = None,
+        motion: Tensor | None = None,
     ) -> SplattingPlan:
         """Look at the radii once, in one small copy from the device. Arguments are those of `forward`."""
-        self._labels(image, coc, depth, motion)
-        return self._plan(image, coc)
+        return self._plan(image, self._labels(image, coc, depth, motion).coc)
 
-    def _plan(self, image: Tensor, coc: Tensor) -> SplattingPlan:
-        coc = coc.detach()
+    def _plan(self, image: Tensor, coc: Tensor | None) -> SplattingPlan:
+        coc = torch.zeros_like(image[:, :1]) if coc is None else coc.detach()
         radius = coc.abs()
         size = (image.shape[-2], image.shape[-1])
         if image.numel() == 0:
@@ -138,7 +153,7 @@ class KernelSplatting(nn.Module):
     def forward(
         self,
         image: Tensor,
-        coc: Tensor,
+        coc: Tensor | None = None,
         *,
         depth: Tensor | None = None,
         motion: Tensor | None = None,
@@ -148,13 +163,14 @@ class KernelSplatting(nn.Module):
 
         Args:
             image: ``(B, C, H, W)`` linear radiance, any number of channels.
-            coc: ``(B, 1, H, W)`` signed radius in px.
+            coc: ``(B, 1, H, W)`` signed radius in px; only a bank whose model needs none may go without.
             depth: ``(B, 1, H, W)`` metres, for a bank whose model asks for it.
             motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter, likewise.
             plan: a plan made earlier with `plan`; the radii are then not looked at again.
 
         Returns:
-            ``(B, C, H, W)`` in the dtype of ``image``, differentiable to ``image``, ``coc`` and the aperture.
+            ``(B, C, H, W)`` in the dtype of ``image``, differentiable to ``image``, ``coc`` and the aperture; with a
+            bank as `torchbokeh.bank_splatting.splat_bank` says.
 
         Raises:
             TypeError: an argument is not a floating-point tensor, or not a `SplattingPlan`.
@@ -162,47 +178,37 @@ class KernelSplatting(nn.Module):
         """
         labels = self._labels(image, coc, depth, motion)
         if plan is None:
-            plan = self._plan(image, coc)
+            plan = self._plan(image, labels.coc)
         elif not isinstance(plan, SplattingPlan):
             raise TypeError(f"plan: expected a SplattingPlan, got {type(plan).__name__}")
         elif plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
-        if plan.sharp and not coc.requires_grad:
+        given = [t for t in labels if t is not None]
+        asked = any(t.requires_grad for t in given)
+        if plan.sharp and not asked:
             return image.clone()
         with torch.autocast(image.device.type, enabled=False):
-            dtype = compute_dtype(image, coc)
-            source, radius, profile = image.to(dtype), coc.to(dtype), self.aperture.profile()
+            dtype = compute_dtype(image, *given)
+            source, labels = image.to(dtype), Labels(*(None if t is None else t.to(dtype) for t in labels))
             if self.bank is not None:
-                labels = Labels(*(None if t is None else t.to(dtype) for t in labels))
-                out = self._from_bank(self.bank, source, labels, plan)
-            elif plan.uniform is not None and not coc.requires_grad:
-                out = blur_uniform(source, plan.uniform, profile)
+                out = blur_with_bank(
+                    source, labels, self.bank, plan.quality.merging, plan.highest, interpolate=self.interpolate
+                )
+            elif plan.uniform is not None and not asked:
+                out = blur_uniform(source, plan.uniform, self.aperture.profile())
             else:
+                radius, profile = needed(labels), self.aperture.profile()
                 out = blur_one_layer(source, radius, profile, plan.quality.merging, plan.highest)
         return out.to(image.dtype)
 
-    def _from_bank(self, bank: PsfBank, image: Tensor, labels: Labels, plan: SplattingPlan) -> Tensor:
-        count = bank.values.shape[1]
-        ones = torch.ones_like(image[:, :1]).expand(-1, count, -1, -1)
-        merging = plan.quality.merging
-        covered = torch.cat([image, ones], 1)
-        out = splat_bank(covered, labels, bank, merging, highest=plan.highest, interpolate=self.interpolate)
-        coverage = out[:, -count:].clamp_min(TINY).repeat(1, image.shape[1] // count, 1, 1)
-        return out[:, :-count] / coverage
-
-    def _labels(self, image: Tensor, coc: Tensor, depth: Tensor | None, motion: Tensor | None) -> Labels:
-        check_image("image", image, ("B", "C", "H", "W"))
-        b, channels, h, w = image.shape
-        signed = signed_coc(None, image, None, coc)
-        for name, given, count in (("depth", depth, 1), ("motion", motion, 2)):
-            if given is None:
-                continue
-            if self.bank is None:
+    def _labels(self, image: Tensor, coc: Tensor | None, depth: Tensor | None, motion: Tensor | None) -> Labels:
+        if self.bank is not None:
+            return bank_labels(self.bank, image, coc, depth, motion)
+        for name, given in (("depth", depth), ("motion", motion)):
+            if given is not None:
                 raise ValueError(f"{name}: expected None without a bank, got a tensor")
-            check_image(name, given, (b, count, h, w), like=image)
-        if self.bank is not None and channels % self.bank.values.shape[1]:
-            raise ValueError(f"image: expected a multiple of 3 channels for coloured PSFs, got {channels}")
-        return Labels(signed, depth, motion)
+        check_image("image", image, ("B", "C", "H", "W"))
+        return Labels(signed_coc(None, image, None, coc))
 
 
 def blur_one_layer(image: Tensor, coc: Tensor, profile: Profile, merging: Merging | None, highest: int) -> Tensor:

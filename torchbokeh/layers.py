@@ -7,17 +7,21 @@ circle of confusion), and all are composed front to back, once for every sub-ape
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchbokeh.bank_splatting import splat_bank
 from torchbokeh.ops.composite import TINY, bin_weights, fill_until_full, pull_push
 from torchbokeh.ops.merge import MARGIN, Merging, splat_merged, upsample
 from torchbokeh.ops.spans import Profile, area
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.ops.surface import blur_surface
+from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.model import Labels
 
 FOREGROUND = (-2.0, -1.0)
 """Signed CoC (px) between which a pixel passes from foreground to rest. What is sharper hides nothing."""
@@ -35,6 +39,24 @@ CERTAIN = 4.0
 """Views of a surface that splats cover to one over this count fully: splats of varying blur thin out, holes do not."""
 
 
+class Moving(NamedTuple):
+    """How a surface moves while the shutter is open.
+
+    Attributes:
+        displacement: ``(B, 2, H, W)``, (dx, dy) in px over the open shutter.
+        bank: the PSFs of defocus with motion, see `torchbokeh.psfs.Combined`.
+        advance: see `torchbokeh.bank_splatting.splat_bank`.
+    """
+
+    displacement: Tensor
+    bank: PsfBank
+    advance: float
+
+    def of_layer(self, number: int) -> "Moving":
+        """The same of one layer, where the displacement is that of several, ``(B, L, 2, H, W)``."""
+        return self._replace(displacement=self.displacement[:, number])
+
+
 @dataclass(frozen=True)
 class Surface:
     """Something with one depth per pixel.
@@ -44,12 +66,23 @@ class Surface:
         alpha: coverage ``(B, 1, H, W)`` in [0, 1]; ``None`` means opaque everywhere.
         coc: ``(B, 1, H, W)`` signed radius in px, continued to where ``alpha`` is 0.
         centres: centres of its bins in px of CoC, front to back.
+        moving: how it moves; ``None`` means that it stands still.
     """
 
     colour: Tensor
     alpha: Tensor | None
     coc: Tensor
     centres: tuple[float, ...]
+    moving: Moving | None = None
+
+    def continued(self) -> "Surface":
+        """The surface with its CoC and motion continued to where it is not."""
+        if self.alpha is None:
+            return self
+        moving = self.moving
+        if moving is not None:
+            moving = moving._replace(displacement=continued(moving.displacement, self.alpha))
+        return replace(self, coc=continued(self.coc, self.alpha), moving=moving)
 
 
 def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
@@ -66,6 +99,7 @@ def split_foreground(
     behind: tuple[Tensor, Tensor | None] | None,
     centres: Sequence[tuple[float, ...]],
     scale: int = 1,
+    moving: Moving | None = None,
 ) -> list[Surface]:
     """What stands in front of the focus plane, and the rest with the hidden part filled in.
 
@@ -80,6 +114,7 @@ def split_foreground(
         centres: bins of the foreground and of the rest.
         scale: fill in blocks of ``scale**2`` pixels: what is hidden is smooth, and blurred in the end. Above 1, the
             CoC of the foreground is not continued beyond it.
+        moving: how the picture moves; what is hidden moves as its surroundings do.
     """
     front, known = front_and_known(coc)
     colour, behind_coc = (None, None) if behind is None else behind
@@ -89,9 +124,15 @@ def split_foreground(
         behind_coc = filled_coc if behind_coc is None else behind_coc
     rest = known * image + (1 - known) * colour
     rest_coc = known * coc + (1 - known) * behind_coc
+    ahead = behind_it = None
+    if moving is not None:
+        filled = pull_push(moving.displacement, torch.maximum(known, 1e-9 * (1 - front)))
+        ahead = moving._replace(displacement=continued(moving.displacement, front))
+        behind_it = moving._replace(displacement=known * moving.displacement + (1 - known) * filled)
+    front_coc = coc if scale > 1 and moving is None else continued(coc, front)
     return [
-        Surface(image * front, front, continued(coc, front) if scale == 1 else coc, centres[0]),
-        Surface(rest, None, rest_coc, centres[1]),
+        Surface(image * front, front, front_coc, centres[0], ahead),
+        Surface(rest, None, rest_coc, centres[1], behind_it),
     ]
 
 
@@ -144,7 +185,7 @@ def _ordinary(image: Tensor, known: Tensor) -> Tensor:
 
 
 def continued(coc: Tensor, alpha: Tensor) -> Tensor:
-    """The CoC of a surface, continued from its surroundings to where the surface is not."""
+    """A map of a surface, its CoC or motion, continued from its surroundings to where the surface is not."""
     here = (alpha > 0).to(coc.dtype)
     return torch.where(here > 0, coc, pull_push(torch.where(here > 0, coc, 0.0), here))
 
@@ -160,7 +201,7 @@ def blurred(
         the surface, beyond the border or behind something else.
     """
     alpha = surface.alpha
-    if merging is not None:
+    if merging is not None and surface.moving is None:
         plain = surface.colour if alpha is None else surface.colour / alpha.clamp_min(TINY)
         colour, coverage = blur_surface(plain, alpha, surface.coc, surface.centres, profile, merging, highest)
         if alpha is None:
@@ -169,16 +210,24 @@ def blurred(
         h, w = coverage.shape[2:]
         whole = upsample(half)[..., 2 * BEYOND : 2 * BEYOND + h, 2 * BEYOND : 2 * BEYOND + w].clamp_min(0)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
+
+    def spread(values: Tensor) -> Tensor:
+        moving = surface.moving
+        if moving is None:
+            return splat_spans(values, surface.coc, profile, integrate=True)
+        labels = Labels(coc=surface.coc, motion=moving.displacement)
+        return splat_bank(values, labels, moving.bank, merging, highest=highest, advance=moving.advance)
+
     source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
     bins = []
     for weight in bin_weights(surface.coc, surface.centres):
-        splat = splat_spans(source * weight, surface.coc, profile, integrate=True)
+        splat = spread(source * weight)
         bins.append((splat[:, :-1], splat[:, -1:]))
     colour, coverage = fill_until_full(bins)
     if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.
-    whole = splat_spans(torch.ones_like(alpha), surface.coc, profile, integrate=True).clamp_min(0)
+    whole = spread(torch.ones_like(alpha)).clamp_min(0)
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 

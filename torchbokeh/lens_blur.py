@@ -1,7 +1,8 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import lru_cache
 from numbers import Real
 
 import torch
@@ -12,10 +13,10 @@ from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
     FOREGROUND,
+    Moving,
     Surface,
     bin_centres,
     compose,
-    continued,
     foreground_over_rest,
     split_foreground,
 )
@@ -23,11 +24,16 @@ from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.convolve import blur_uniform
-from torchbokeh.ops.merge import Merging, highest_level
+from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
-from torchbokeh.plan import Hidden, Plan
-from torchbokeh.psfs.aperture import Aperture, parse_aperture
+from torchbokeh.plan import Hidden, Plan, Seen
+from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
+from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.combined import STILL
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
+
+ADVANCE = {"centre": 0.0, "start": 0.5}
+"""Moments that a picture may show, and the part of its motion by which the middle of the exposure is ahead."""
 
 Background = Tensor | tuple[Tensor, Tensor] | None
 
@@ -52,6 +58,8 @@ class LensBlur(nn.Module):
         subapertures: the lens is cut into ``subapertures**2`` pieces that are composed one by one, which keeps the
             relation of coverage and lens position where blurred surfaces overlap. ``"auto"``: at the two best
             qualities, 3 where all that is hidden is known and 2 where it is guessed; 1 where nothing hides anything.
+            With motion, the lens is not cut.
+        shutter: which moment of the exposure a picture with motion shows: ``"centre"`` or ``"start"``.
 
     Raises:
         TypeError: an argument of the wrong kind.
@@ -76,6 +84,7 @@ class LensBlur(nn.Module):
         tolerance: float | None = None,
         max_coc: float | None = None,
         subapertures: int | str = "auto",
+        shutter: str = "centre",
     ) -> None:
         super().__init__()
         if lens is not None and not isinstance(lens, Lens):
@@ -85,6 +94,8 @@ class LensBlur(nn.Module):
             raise TypeError(f"max_coc: expected a number or None, got {max_coc!r}")
         if max_coc is not None and not max_coc > 0:
             raise ValueError(f"max_coc: expected a radius in px above 0, got {max_coc}")
+        if shutter not in ADVANCE:
+            raise ValueError(f"shutter: expected one of {', '.join(map(repr, ADVANCE))}, got {shutter!r}")
         self.lens = lens
         self.aperture = parse_aperture(aperture)
         self.layers = _count("layers", layers)
@@ -92,12 +103,13 @@ class LensBlur(nn.Module):
         self.tolerance = tolerance
         self.max_coc = max_coc
         self.subapertures = _count("subapertures", subapertures)
+        self.shutter = shutter
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
         return (
             f"layers={self.layers or 'auto'}, quality={self.quality!r}, tolerance={self.tolerance}, "
-            f"max_coc={self.max_coc}, subapertures={self.subapertures or 'auto'}"
+            f"max_coc={self.max_coc}, subapertures={self.subapertures or 'auto'}, shutter={self.shutter!r}"
         )
 
     def plan(
@@ -106,6 +118,7 @@ class LensBlur(nn.Module):
         depth: Tensor | None = None,
         *,
         coc: Tensor | None = None,
+        motion: Tensor | None = None,
         background: Background = None,
     ) -> Plan:
         """Look at a scene once and say what it needs. Arguments are those of `forward`.
@@ -113,14 +126,27 @@ class LensBlur(nn.Module):
         One small copy from the device, which a forward pass with ``plan=`` saves.
         """
         _, signed, cut = self._inputs(image, depth, coc, background)
-        return self._plan(image, signed, cut, background is not None)
+        longest = self._longest(image, motion)
+        return self._plan(image, signed, cut, longest, background is not None)
 
-    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, background: bool) -> Plan:
+    def _longest(self, image: Tensor, motion: Tensor | None) -> float:
+        """Check the motion; return the largest displacement in px."""
+        if motion is None:
+            return 0.0
+        check_image("motion", motion, (*image.shape[:-3], 2, *image.shape[-2:]), like=image)
+        if not isinstance(self.aperture, Disc):
+            raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
+        longest = float(motion.detach().norm(dim=-3).max()) if motion.numel() else 0.0
+        if not math.isfinite(longest):
+            raise ValueError(f"motion: expected finite values, got {int((~motion.isfinite()).sum())} that are not")
+        return longest
+
+    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, longest: float, background: bool) -> Plan:
         with torch.no_grad():
             if image.numel() == 0:
                 raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
             if image.dim() == 5:
-                return self._plan_layers(image, signed, cut)
+                return self._plan_layers(image, signed, cut, longest)
             *_, height, width = image.shape
             share = signed.new_zeros(()) if cut is None else cut.to(signed.dtype).mean()
             look = [*signed.aminmax(), share, *self._shares(signed)]
@@ -138,14 +164,13 @@ class LensBlur(nn.Module):
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
-            return self._finish(
-                (height, width), (low, high), clamped, 0, ((), ()), hidden, bins, occludes, quality, error
-            )
+            seen = Seen((height, width), (low, high), clamped, longest, 0, (), ())
+            return self._finish(seen, hidden, bins, occludes, quality, error)
 
     def _shares(self, signed: Tensor) -> list[Tensor]:
         return merged_shares(signed, self.quality, self.tolerance)
 
-    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None) -> Plan:
+    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None, longest: float) -> Plan:
         *_, height, width = image.shape
         held = image[:, :, 3:] > 0
         low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
@@ -163,35 +188,32 @@ class LensBlur(nn.Module):
         bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
         span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
         occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        return self._finish(
-            (height, width), span, clamped, count, (kept, opaque), "layers", bins, occludes, quality, error
-        )
+        seen = Seen((height, width), span, clamped, longest, count, kept, opaque)
+        return self._finish(seen, "layers", bins, occludes, quality, error)
 
     def _finish(
         self,
-        size: tuple[int, int],
-        span: tuple[float, float],
-        clamped: float,
-        count: int,
-        kept: tuple[tuple[int, ...], tuple[int, ...]],
+        seen: Seen,
         hidden: Hidden,
         bins: tuple[tuple[float, ...], ...],
         occludes: bool,
         quality: Quality,
         error: float,
     ) -> Plan:
-        largest = max(abs(span[0]), abs(span[1]))
-        if self.subapertures is not None:
+        largest = max(abs(seen.coc_range[0]), abs(seen.coc_range[1]))
+        moves = seen.motion > STILL[0]
+        if moves:
+            pieces = 1
+        elif self.subapertures is not None:
             pieces = self.subapertures
         elif not occludes or largest < 3:
             pieces = 1
         else:
             pieces = quality.subapertures[hidden in ("given", "layers")]
         merging = quality.merging
-        highest = 0 if merging is None else highest_level(largest, size, merging)
-        sharp = largest <= MIN_RADIUS and hidden != "layers"
-        aperture = repr(self.aperture)
-        return Plan(size, span, clamped, sharp, count, *kept, hidden, bins, pieces, aperture, quality, highest, error)
+        highest = 0 if merging is None else highest_level(largest, seen.size, merging)
+        sharp = largest <= MIN_RADIUS and hidden != "layers" and not moves
+        return Plan(*seen, sharp, hidden, bins, pieces, repr(self.aperture), quality, highest, error)
 
     def forward(
         self,
@@ -199,6 +221,7 @@ class LensBlur(nn.Module):
         depth: Tensor | None = None,
         *,
         coc: Tensor | None = None,
+        motion: Tensor | None = None,
         background: Background = None,
         plan: Plan | None = None,
     ) -> Tensor:
@@ -210,6 +233,8 @@ class LensBlur(nn.Module):
             depth: ``(B, 1, H, W)``, or ``(B, L, 1, H, W)`` for layers: metres (``inf`` is sky) for a `ThinLens`,
                 disparity for a `DisparityLens`.
             coc: signed CoC radius in px, in the place of ``depth``.
+            motion: displacement (dx, dy) in px over the open shutter, ``(B, 2, H, W)`` or ``(B, L, 2, H, W)``: motion
+                blur in the same pass, for which the aperture must be a disc.
             background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
                 its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
             plan: a plan made earlier with `plan`; the scene is then not looked at again.
@@ -225,8 +250,9 @@ class LensBlur(nn.Module):
         if image.numel() == 0:
             return image.clone() if image.dim() == 4 else image.sum(1)
         if plan is None:
-            plan = self._plan(image, signed, cut, background is not None)
-        self._check_plan(plan, image, background)
+            plan = self._plan(image, signed, cut, self._longest(image, motion), background is not None)
+        self._check_plan(plan, image, motion, background)
+        moving = self._moving(plan, image, motion)
         if plan.sharp and not signed.requires_grad:
             return image.clone()
         dtype = compute_dtype(signed, image)
@@ -240,24 +266,24 @@ class LensBlur(nn.Module):
                     return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
 
                 surfaces = [
-                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins)
+                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving and moving.of_layer(k))
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
-                if merging is None:
-                    surfaces = [s if s.alpha is None else replace(s, coc=continued(s.coc, s.alpha)) for s in surfaces]
+                if merging is None or moving is not None:
+                    surfaces = [s.continued() for s in surfaces]
                 out = (
                     torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
                     if surfaces
                     else torch.zeros_like(source[:, 0])
                 )
-            elif plan.uniform is not None and not signed.requires_grad:
+            elif moving is None and plan.uniform is not None and not signed.requires_grad:
                 out = blur_uniform(source, plan.uniform, self.aperture.profile())
             elif len(plan.bins) == 2:
-                out = self._over_rest(source, radii, behind, plan, pieces, merging)
-            elif len(plan.bins[0]) == 1 and len(pieces) == 1:
+                out = self._over_rest(source, radii, behind, plan, pieces, moving)
+            elif moving is None and len(plan.bins[0]) == 1 and len(pieces) == 1:
                 out = blur_one_layer(source, radii, pieces[0], merging, plan.highest)
             else:
-                out, _ = compose([Surface(source, None, radii, plan.bins[0])], pieces, merging, plan.highest)
+                out, _ = compose([Surface(source, None, radii, plan.bins[0], moving)], pieces, merging, plan.highest)
         return out.to(image.dtype)
 
     def _over_rest(
@@ -267,17 +293,23 @@ class LensBlur(nn.Module):
         behind: tuple[Tensor, Tensor | None] | None,
         plan: Plan,
         pieces: Sequence[Profile],
-        merging: Merging | None,
+        moving: Moving | None,
     ) -> Tensor:
-        coarse = plan.quality.coarse
+        coarse, merging = plan.quality.coarse, plan.quality.merging
         asked = torch.is_grad_enabled() and any(
             t.requires_grad for t in (image, radii, pieces[0].knots, pieces[0].bulge)
         )
-        simple = behind is None and len(pieces) == 1 and image.shape[1] <= 3 and not asked
+        simple = behind is None and moving is None and len(pieces) == 1 and image.shape[1] <= 3 and not asked
         if merging is not None and coarse and simple and has_kernel(image):
             return foreground_over_rest(image.detach(), radii.detach(), plan.bins, pieces[0], merging, plan.highest)
-        surfaces = split_foreground(image, radii, behind, plan.bins, COARSE if coarse else 1)
+        surfaces = split_foreground(image, radii, behind, plan.bins, COARSE if coarse else 1, moving)
         return compose(surfaces, pieces, merging, plan.highest)[0]
+
+    def _moving(self, plan: Plan, image: Tensor, motion: Tensor | None) -> Moving | None:
+        if motion is None or not plan.moves:
+            return None
+        dtype = compute_dtype(motion, image)
+        return Moving(motion.to(dtype), bank_of_motion(image.device), ADVANCE[self.shutter])
 
     def _inputs(
         self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background
@@ -304,16 +336,24 @@ class LensBlur(nn.Module):
         return (colour, behind), signed, cut
 
     @staticmethod
-    def _check_plan(plan: Plan, image: Tensor, background: Background) -> None:
+    def _check_plan(plan: Plan, image: Tensor, motion: Tensor | None, background: Background) -> None:
         if not isinstance(plan, Plan):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
         if plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
+        if plan.moves and motion is None:
+            raise ValueError("plan: expected the motion it was made with, got none")
         count = image.shape[1] if image.dim() == 5 else 0
         if plan.layer_count != count:
             raise ValueError(f"plan: expected one for {count} layers, got one for {plan.layer_count}")
         if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (background is not None):
             raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
+
+
+@lru_cache(maxsize=4)
+def bank_of_motion(device: torch.device) -> PsfBank:
+    """The bank of `torchbokeh.psfs.Combined` that comes with the package."""
+    return PsfBank.load("combined").to(device)
 
 
 def _count(name: str, value: int | str) -> int | None:

@@ -1,9 +1,10 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from torchbokeh.ops.convolve import CONVOLVE_FROM
+from torchbokeh.psfs.combined import STILL
 from torchbokeh.quality import Quality
 
 Hidden = Literal["nothing", "filled", "given", "layers"]
@@ -14,6 +15,18 @@ _HIDDEN = {
 }
 
 
+class Seen(NamedTuple):
+    """What a look at a scene finds: the first attributes of a `Plan`."""
+
+    size: tuple[int, int]
+    coc_range: tuple[float, float]
+    clamped: float
+    motion: float
+    layer_count: int
+    layers: tuple[int, ...]
+    opaque: tuple[int, ...]
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a scene needs, and by that what is left out.
@@ -22,10 +35,11 @@ class Plan:
         size: ``(H, W)`` of the image.
         coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
         clamped: share of the pixels whose radius ``max_coc`` cut.
-        sharp: every radius is below half a pixel: the image passes through.
+        motion: longest displacement in px over the open shutter.
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
         opaque: indices of those that cover everything: their coverage needs no looking at.
+        sharp: every radius is below half a pixel and nothing moves: the image passes through.
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
@@ -38,10 +52,11 @@ class Plan:
     size: tuple[int, int]
     coc_range: tuple[float, float]
     clamped: float
-    sharp: bool
+    motion: float
     layer_count: int
     layers: tuple[int, ...]
     opaque: tuple[int, ...]
+    sharp: bool
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]
     subapertures: int
@@ -51,11 +66,16 @@ class Plan:
     predicted_error: float
 
     @property
+    def moves(self) -> bool:
+        """Whether motion is to be seen."""
+        return self.motion > STILL[0]
+
+    @property
     def uniform(self) -> float | None:
         """The signed radius in px that all pixels share, where one convolution does it; else None."""
         low, high = self.coc_range
-        one = low == high and abs(low) >= CONVOLVE_FROM and self.hidden == "nothing" and self.highest == 0
-        return low if one else None
+        alone = self.hidden == "nothing" and self.highest == 0 and not self.moves
+        return low if alone and low == high and abs(low) >= CONVOLVE_FROM else None
 
     def __str__(self) -> str:
         height, width = self.size
@@ -75,7 +95,9 @@ class Plan:
             lines.append(f"The foreground is blurred over the rest ({counts} bins); {_HIDDEN[self.hidden]}.")
         else:
             lines.append(f"One surface in {counts} bin{'s' if len(self.bins[0]) > 1 else ''}: no foreground is needed.")
-        if self.subapertures > 1:
+        if self.moves:
+            lines.append(f"Motion up to {self.motion:.1f} px, in one splat with the defocus, through the whole lens.")
+        elif self.subapertures > 1:
             lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
         else:
             lines.append(f"{self.aperture}, whole: nothing hides anything, or the blur is too small to show it.")

@@ -18,8 +18,9 @@ from torchbokeh.psfs.model import PsfModel
 from torchbokeh.psfs.models import MODELS, model_from
 from torchbokeh.psfs.represent import DOMAINS, Represented, Target, laplacian, nonzero, scanline
 from torchbokeh.psfs.sheet import contact_sheet
+from torchbokeh.psfs.similarity import centred
 from torchbokeh.psfs.simple_lens import SimpleLens
-from torchbokeh.psfs.table import held_out, integrated, sparsity
+from torchbokeh.psfs.table import held_out, integrated, resized, sparsity
 
 
 class Small(SimpleLens):
@@ -217,6 +218,21 @@ def test_held_out_psfs_are_near_their_samples(small: PsfBank) -> None:
     assert 0.6 < np.mean([f.ssim for f in found]) < 1
     assert [f.ssim for f in held_out(small, 20)] == [f.ssim for f in found]
     assert sparsity(small).shape == (6,)
+
+
+@pytest.mark.parametrize("domain", ["direct", "laplacian"])
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.15])
+def test_a_sample_is_drawn_larger(domain: str, factor: float) -> None:
+    psf = capsule(8.0, 12.0)
+    sparse = nonzero(psf) if domain == "direct" else nonzero(laplacian(psf))
+    got = integrated(resized(Represented(domain, sparse), factor), (61, 61))  # type: ignore[arg-type]
+    want = centred(capsule(8.0 * factor, 12.0 * factor), (61, 61))
+    assert got.sum() == pytest.approx(1, abs=2e-3)
+    assert np.abs(got - want).sum() < (0.12 if domain == "direct" else 0.06) * (factor != 1) + 1e-9
+
+
+def test_extents_are_those_of_the_middles(small: PsfBank) -> None:
+    assert torch.equal(small.extents, torch.ones(6, dtype=torch.float64))
 
 
 def test_a_contact_sheet_shows_five_pictures_of_each(small: PsfBank) -> None:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 import torchbokeh.psfs.combined
 import torchbokeh.psfs.simple_lens
-from torchbokeh.psfs.combined import Combined, capsule
+from torchbokeh.psfs.combined import SHARING, Combined, capsule
 from torchbokeh.psfs.model import FRAME, Labels
+from torchbokeh.psfs.similarity import centred
 from torchbokeh.psfs.simple_lens import SimpleLens
 
 F64 = torch.float64
@@ -68,7 +69,7 @@ def labels(radius: float, dx: float, dy: float) -> Labels:
 
 def test_the_place_of_a_pixel() -> None:
     place = Combined().place(labels(-8.0, 3.0, 4.0))
-    assert place.coordinates.flatten().tolist() == pytest.approx([7.5, 5.0])
+    assert place.coordinates.flatten().tolist() == pytest.approx([math.sqrt(64 - SHARING) - 0.5, 5.0])
     torch.testing.assert_close(place.frame[0, :, :, 0, 0], torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=F64))
     assert place.scale is None
     still = Combined().place(labels(2.0, 0.0, 0.0))
@@ -77,10 +78,10 @@ def test_the_place_of_a_pixel() -> None:
 
 def test_a_disc_beyond_the_bound_is_a_larger_one_of_it() -> None:
     (place,) = Combined(radius=50.0, length=64.0).places(labels(200.0, 80.0, 0.0))
-    assert place.coordinates.flatten().tolist() == pytest.approx([49.5, 20.0])
+    assert place.coordinates.flatten().tolist() == pytest.approx([49.5, 20.0], rel=1e-4)
     assert place.scale is not None
-    assert place.scale.item() == 4
-    torch.testing.assert_close(place.frame[0, :, :, 0, 0], 4 * torch.eye(2, dtype=F64))
+    assert place.scale.item() == pytest.approx(4, rel=1e-4)
+    torch.testing.assert_close(place.frame[0, :, :, 0, 0], 4 * torch.eye(2, dtype=F64), rtol=1e-4, atol=0)
     (disc,) = SimpleLens(radius=50.0).places(Labels(coc=torch.full((1, 1, 1, 1), 75.0)))
     assert disc.scale is not None
     assert disc.scale.item() == 1.5
@@ -128,17 +129,28 @@ def test_missing_maps_are_named() -> None:
         SimpleLens().place(Labels())
 
 
-def test_prefiltering_is_a_mean_over_the_box() -> None:
+def test_the_extent_is_that_of_the_light() -> None:
     model = Combined()
-    low, high = (9.5, 20.0), (10.5, 24.0)
-    blurred = model.prefiltered(low, high)
+    for radius, length in ((12.0, 0.0), (5.0, 60.0), (20.0, 20.0)):
+        psf = model.dense((radius - 0.5, length))[0]
+        x = np.arange(psf.shape[1]) - psf.shape[1] // 2
+        extent = model.extent(torch.tensor([radius - 0.5, length], dtype=F64)).item()
+        assert extent == pytest.approx(4 * math.sqrt((psf.sum(0) * x**2).sum()), rel=0.01)
+
+
+def test_prefiltering_is_a_mean_over_shapes_of_one_size() -> None:
+    model = Combined()
+    low, high = (9.5, 20.0), (14.5, 30.0)
+    middle = model.grid.unmap(model.grid.remap(torch.tensor([low, high], dtype=F64)).mean(0))
+    blurred, sharp = model.prefiltered(low, high), model.dense(middle.tolist())
     assert blurred.sum() == pytest.approx(1)
-    assert blurred.shape == model.dense(high)[:, :, 1:-1].shape or blurred.shape == model.dense(high).shape
-    middle = model.dense((10.0, 22.0))
-    inside = (0, middle.shape[1] // 2, middle.shape[2] // 2)
-    centre = (0, blurred.shape[1] // 2, blurred.shape[2] // 2)
-    assert blurred[centre] == pytest.approx(middle[inside], rel=0.02)
-    np.testing.assert_allclose(model.prefiltered((9.5, 20.0), (9.5, 20.0)), model.dense((9.5, 20.0)))
+    for psf in (blurred, sharp):
+        x = np.arange(psf.shape[2]) - psf.shape[2] // 2
+        assert 4 * math.sqrt((psf.sum((0, 1)) * x**2).sum()) == pytest.approx(model.extent(middle).item(), rel=0.01)
+    size = tuple(max(a, b) for a, b in zip(blurred.shape[1:], sharp.shape[1:], strict=True))
+    assert 0.005 < np.abs(centred(blurred, size) - centred(sharp, size)).sum() < 0.15
+    same = model.prefiltered((9.5, 20.0), (9.5, 20.0))
+    np.testing.assert_allclose(same, model.dense((9.5, 20.0)), atol=1e-15)
 
 
 def test_examples() -> None:

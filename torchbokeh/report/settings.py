@@ -31,6 +31,8 @@ class Settings:
         memory_sizes: those of ``sweep_sizes`` at which peak memory is measured.
         sweep_radius: blur where something else varies.
         layer_counts: of run time against layers.
+        motion_size: of defocus with motion.
+        motions: of that, pairs of largest radius and longest motion in px.
     """
 
     scenes: tuple[str, ...] = NAMES
@@ -53,6 +55,8 @@ class Settings:
     memory_sizes: tuple[int, ...] = (1024, 4096)
     sweep_radius: float = 25.0
     layer_counts: tuple[int, ...] = (1, 2, 4, 8, 16)
+    motion_size: int = 1024
+    motions: tuple[tuple[float, float], ...] = ((25.0, 40.0), (60.0, 120.0))
 
     def row(self) -> dict[str, Any]:
         """Everything, for the record."""
@@ -82,4 +86,6 @@ def quick(scenes: tuple[str, ...] = NAMES) -> Settings:
         memory_sizes=(128,),
         sweep_radius=8.0,
         layer_counts=(1, 4),
+        motion_size=64,
+        motions=((6.0, 12.0),),
     )

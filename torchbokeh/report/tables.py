@@ -25,6 +25,7 @@ def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
         _pixels(rows["pixels"], plots),
         _layers(rows["layers"], plots),
         _threads(rows["threads"], settings, plots),
+        _motion(rows["motion"]),
         _left_out(rows["left_out"], settings),
         _stages(rows["stages"]),
         _methods(found["methods"], found["absent"]),
@@ -264,6 +265,20 @@ def _threads(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
         if same
         else f"The bits depend on the threads: {', '.join(differ)}.",
     )
+
+
+def _motion(rows: list[Row]) -> str:
+    if not rows:
+        return ""
+    size = f"{rows[0]['size']} x {rows[0]['size']}"
+    cells = []
+    for row in rows:
+        errors = [_number(row["ssim"], ".4f"), _number(row["psnr"], ".1f"), _number(row["l1"], ".4f")]
+        what = [f"{row['radius']:g}", f"{row['longest']:g}", row["method"]]
+        cells.append([*what, seconds(row["seconds"]), f"{row['times_dense']:.1f}", *errors])
+    head = ["radius", "motion", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
+    about = f"photo, {size}, turning; up to so many px of radius and motion; errors against the dense scatter."
+    return _section("Defocus with motion", about, table(head, cells))
 
 
 def _left_out(rows: list[Row], settings: Row) -> str:

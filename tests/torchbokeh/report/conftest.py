@@ -23,6 +23,8 @@ TINY = Settings(
     sweep_radius=4.0,
     memory_sizes=(64,),
     layer_counts=(1, 3),
+    motion_size=48,
+    motions=((6.0, 10.0),),
 )
 
 

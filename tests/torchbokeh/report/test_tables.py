@@ -26,6 +26,7 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Run time and memory against pixels",
         "Run time against layers",
         "Run time against threads",
+        "Defocus with motion",
         "What a plan leaves out",
         "What the methods are",
     ]

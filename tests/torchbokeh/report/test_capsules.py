@@ -1,0 +1,52 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("numba")
+
+from torchbokeh.ops.dense import dense_spans
+from torchbokeh.psfs import Disc
+from torchbokeh.psfs.combined import capsule
+from torchbokeh.report.capsules import dense_capsules
+
+
+def picture(n, radius, dx, dy):
+    image = torch.ones(1, 3, n, n)
+    image[..., n // 2, n // 2] += 1e4
+    motion = torch.tensor([dx, dy]).view(1, 2, 1, 1).expand(1, 2, n, n).contiguous()
+    return image, torch.full((1, 1, n, n), radius), motion
+
+
+@pytest.mark.parametrize(("radius", "length"), [(6.0, 14.0), (2.0, 20.0), (9.0, 0.0)])
+def test_a_dot_is_the_capsule(radius, length):
+    n = 61
+    got = ((dense_capsules(*picture(n, radius, -length, 0.0)) - 1) / 1e4)[0, 0].double().numpy()
+    want = np.zeros((n, n))
+    psf = capsule(radius, length)[0]
+    y, x = (n - psf.shape[0]) // 2, (n - psf.shape[1]) // 2
+    want[y : y + psf.shape[0], x : x + psf.shape[1]] = psf
+    assert got.sum() == pytest.approx(1, abs=2e-3)
+    assert np.abs(got - want).sum() < 0.08
+
+
+def test_it_turns_with_the_motion():
+    n, length, angle = 61, 24.0, 0.7
+    got = (dense_capsules(*picture(n, 4.0, length * math.cos(angle), length * math.sin(angle)))[0, 0] - 1) / 1e4
+    at = torch.arange(n) - n // 2
+    along = at[None] * math.cos(angle) + at[:, None] * math.sin(angle)
+    across = at[:, None] * math.cos(angle) - at[None] * math.sin(angle)
+    assert float((got * along**2).sum()) == pytest.approx(4**2 / 4 + length**2 / 12, rel=0.03)
+    assert float((got * across**2).sum()) == pytest.approx(4**2 / 4, rel=0.05)
+
+
+def test_without_motion_it_is_the_dense_scatter_and_a_constant_stays():
+    draw = torch.Generator().manual_seed(1)
+    image, coc = torch.rand(1, 3, 40, 50, generator=draw), 9 * torch.rand(1, 1, 40, 50, generator=draw)
+    still = torch.zeros(1, 2, 40, 50)
+    values = dense_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, Disc().profile())
+    want = (values[:, :3] / values[:, 3:]).float()
+    assert float((dense_capsules(image, coc, still) - want).abs().mean()) < 0.01  # the rim is sampled, not integrated
+    moving = 20 * torch.rand(1, 2, 40, 50, generator=draw)
+    torch.testing.assert_close(dense_capsules(torch.ones_like(image), coc, moving), torch.ones_like(image))

@@ -1,0 +1,189 @@
+"""`LensBlur` with motion: limits, symmetries, the truth of a small scene, gradients, and what is refused."""
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchbokeh as tb
+from torchbokeh import LensBlur
+from torchbokeh.report.measure import errors
+
+H, W = 40, 56
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def picture(seed: int = 0, batch: int = 1) -> Tensor:
+    return torch.rand(batch, 3, H, W, generator=draw(seed))
+
+
+def constant(*values: float, batch: int = 1) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32).view(1, -1, 1, 1).expand(batch, -1, H, W).contiguous()
+
+
+def halves(left: float, right: float) -> Tensor:
+    coc = torch.full((1, 1, H, W), float(right))
+    coc[..., : W // 2] = left
+    return coc
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+@pytest.mark.parametrize("coc", [halves(0, 0), halves(4, 4), halves(-7, 5)])
+def test_what_stands_still_needs_no_motion(quality: str, coc: Tensor) -> None:
+    blur = LensBlur(quality=quality, subapertures=1)
+    still = blur(picture(), coc=coc)
+    assert torch.equal(blur(picture(), coc=coc, motion=constant(0.3, -0.2)), still)
+    assert not blur.plan(picture(), coc=coc, motion=constant(0.3, 0.0)).moves
+
+
+def test_little_motion_changes_little() -> None:
+    blur, image, coc = LensBlur(subapertures=1, layers=1), picture(), halves(3, 3)
+    still = blur(image, coc=coc)
+    step = [(blur(image, coc=coc, motion=constant(x, 0.0)) - still).abs().mean().item() for x in (0.51, 0.7, 1.0, 1.3)]
+    assert all(a < b for a, b in pairwise(step))
+    assert step[0] < 1e-4
+    assert step[-1] < 5e-3
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+@pytest.mark.parametrize("coc", [halves(0, 0), halves(9, 3), halves(-7, 5)])
+def test_constant_in_constant_out(quality: str, coc: Tensor) -> None:
+    motion = 25 * (torch.rand(1, 2, H, W, generator=draw(3)) - 0.5)
+    out = LensBlur(quality=quality)(torch.full((1, 3, H, W), 0.6), coc=coc, motion=motion)
+    torch.testing.assert_close(out, torch.full_like(out, 0.6), atol=1e-4, rtol=0)
+
+
+def test_an_edge_moves_along_the_motion_only() -> None:
+    image = torch.zeros(1, 3, H, W)
+    image[..., W // 2 :] = 1.0
+    blur = LensBlur()
+    across = blur(image, coc=halves(0, 0), motion=constant(16.0, 0.0))[0, 0, H // 2]
+    along = blur(image, coc=halves(0, 0), motion=constant(0.0, 16.0))[0, 0, H // 2]
+    torch.testing.assert_close(along, image[0, 0, 0], atol=0.02, rtol=0)
+    ramp = (torch.arange(W) - W / 2 + 8.5).div(16).clamp(0, 1)
+    torch.testing.assert_close(across, ramp, atol=0.05, rtol=0)
+
+
+def test_the_shutter_may_open_with_the_picture() -> None:
+    image, coc = picture(), halves(2, 2)
+    motion = constant(12.0, -8.0)
+    centred, started = (LensBlur(shutter=s)(image, coc=coc, motion=motion) for s in ("centre", "start"))
+    inside = (..., slice(16, -16), slice(18, -18))  # beyond the reach of what is unknown outside
+    moved = centred.roll((-4, 6), (2, 3))  # half of the motion
+    torch.testing.assert_close(started[inside], moved[inside], atol=2e-3, rtol=0)
+    back = LensBlur()(image, coc=coc, motion=-motion)
+    torch.testing.assert_close(back, centred, atol=1e-5, rtol=0)
+    behind = LensBlur(shutter="start")(image, coc=coc, motion=-motion)
+    assert float((behind - started).abs().max()) > 0.05
+
+
+def test_one_opaque_layer_is_a_plain_picture() -> None:
+    image, coc, motion = picture(), halves(2, 6), constant(9.0, 5.0)
+    layer = torch.cat([image, torch.ones(1, 1, H, W)], 1)[:, None]
+    blur = LensBlur(layers=2)
+    out = blur(layer, coc=coc[:, None], motion=motion[:, None])
+    torch.testing.assert_close(out[:, :3], blur(image, coc=coc, motion=motion), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(out[:, 3:], torch.ones(1, 1, H, W), atol=1e-4, rtol=0)
+
+
+def test_a_batch_is_one_by_one() -> None:
+    image, motion = picture(1, 3), 20 * (torch.rand(3, 2, H, W, generator=draw(2)) - 0.5)
+    coc = torch.cat([halves(-5, 4), halves(3, 3), halves(0, 8)])
+    blur = LensBlur()
+    plan = blur.plan(image, coc=coc, motion=motion)
+    together = blur(image, coc=coc, motion=motion, plan=plan)
+    for n in range(3):
+        one = blur(image[n : n + 1], coc=coc[n : n + 1], motion=motion[n : n + 1], plan=plan)
+        torch.testing.assert_close(together[n : n + 1], one, atol=5e-4, rtol=0)  # pads differ, and so does what leaks
+
+
+def test_gradients_reach_picture_radius_and_motion() -> None:
+    image, coc = picture().double(), halves(-4, 5).double()
+    motion = 14 * (torch.rand(1, 2, H, W, generator=draw(4), dtype=torch.float64) - 0.5)
+    aim = torch.rand(1, 3, H, W, generator=draw(5), dtype=torch.float64)
+    blur = LensBlur(layers=1)
+    plan = blur.plan(image, coc=coc, motion=motion)
+    maps = [t.clone().requires_grad_() for t in (image, coc, motion)]
+
+    def loss(image: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
+        return (aim * blur(image, coc=coc, motion=motion, plan=plan)).sum()
+
+    grads = torch.autograd.grad(loss(*maps), maps)
+    for grad in grads:
+        assert grad.isfinite().all()
+        assert float(grad.abs().max()) > 1e-3
+    step = torch.rand(1, 3, H, W, generator=draw(6), dtype=torch.float64)
+    ends = [loss(image + e * step, coc, motion).item() for e in (1e-4, -1e-4)]
+    assert (ends[0] - ends[1]) / 2e-4 == pytest.approx((grads[0] * step).sum().item(), rel=1e-6)
+
+
+def test_motion_can_be_recovered_from_a_blurred_picture() -> None:
+    image, coc = picture(), halves(1, 1)
+    blur = LensBlur(layers=1)
+    wanted = blur(image, coc=coc, motion=constant(9.0, 0.0))
+    length = torch.tensor(5.0, requires_grad=True)
+    optimiser = torch.optim.Adam([length], lr=0.4)
+    losses = []
+    for _ in range(25):
+        motion = torch.stack([length.expand(1, H, W), torch.zeros(1, H, W)], 1)
+        loss = (blur(image, coc=coc, motion=motion) - wanted).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+    assert length.item() == pytest.approx(9.0, abs=1.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("recipe", "image_ssim", "layers_ssim"), [("whirl", 0.95, 0.97), ("gears", 0.93, 0.96)])
+def test_it_is_near_the_truth(recipe: str, image_ssim: float, layers_ssim: float) -> None:
+    scene, camera = getattr(tb.scenes, recipe)(seed=0, size=(128, 128), blur=6.0)
+    seen = {name: t[None] for name, t in scene.render(camera).items()}
+    truth = tb.AccumulationBuffer(views=512)(scene, camera)[:, :3]
+    blur = LensBlur(camera.lens)
+    single = blur(seen["image"], seen["depth"], motion=seen["motion"])
+    layered = blur(seen["layers"], seen["layer_depth"], motion=seen["layer_motion"])[:, :3]
+    still = blur(seen["layers"], seen["layer_depth"])[:, :3]
+    ssim = [errors(out, truth, 20, flip=False)["ssim"] for out in (single, layered, still)]
+    assert ssim[0] > image_ssim
+    assert ssim[1] > layers_ssim
+    assert ssim[2] < ssim[1] - 0.03
+
+
+def test_the_plan_says_that_things_move() -> None:
+    blur = LensBlur()
+    plan = blur.plan(picture(), coc=halves(-6, 5), motion=constant(3.0, 4.0))
+    assert plan.motion == pytest.approx(5)
+    assert plan.moves
+    assert plan.subapertures == 1
+    assert "Motion up to 5.0 px" in str(plan)
+    sharp = blur.plan(picture(), coc=halves(0, 0), motion=constant(3.0, 4.0))
+    assert not sharp.sharp
+    layers = torch.cat([picture(), torch.ones(1, 1, H, W)], 1)[:, None]
+    assert blur.plan(layers, coc=halves(1, 1)[:, None], motion=constant(3.0, 4.0)[:, None]).moves
+
+
+def test_what_is_refused() -> None:
+    image, coc = picture(), halves(1, 1)
+    with pytest.raises(ValueError, match="shutter: expected one of 'centre', 'start', got 'end'"):
+        LensBlur(shutter="end")
+    with pytest.raises(ValueError, match=r"motion: expected shape \(1, 2, 40, 56\), got \(1, 1, 40, 56\)"):
+        LensBlur()(image, coc=coc, motion=coc)
+    endless = constant(1.0, 1.0)
+    endless[0, 0, 3, 4] = math.inf
+    with pytest.raises(ValueError, match="motion: expected finite values, got 1 that are not"):
+        LensBlur()(image, coc=coc, motion=endless)
+    with pytest.raises(ValueError, match="motion: expected None with an aperture that is not a disc"):
+        LensBlur(aperture="6-gon")(image, coc=coc, motion=constant(1.0, 1.0))
+    plan = LensBlur().plan(image, coc=coc, motion=constant(4.0, 0.0))
+    with pytest.raises(ValueError, match="plan: expected the motion it was made with, got none"):
+        LensBlur()(image, coc=coc, plan=plan)
+    still = dataclasses.replace(plan, motion=0.0)
+    assert torch.equal(LensBlur()(image, coc=coc, motion=constant(9.0, 0.0), plan=still), LensBlur()(image, coc=coc))
