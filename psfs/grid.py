@@ -10,10 +10,14 @@ boxes have edges of ``l + 1``, or what is left of them at the upper border. In o
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import product
 
 import torch
 from torch import Tensor
+
+LARGEST = 1 << 24
+"""Units of a grid, at most: there is a table of them."""
 
 
 def triangular_root(x: Tensor) -> Tensor:
@@ -51,6 +55,8 @@ class NestedGrid:
                 raise ValueError(f"{name}: expected finite numbers above 0, got {tuple(given)}")
         if any(n != int(n) for n in cells):
             raise ValueError(f"cells: expected whole numbers, got {tuple(cells)}")
+        if math.prod(cells) > LARGEST:
+            raise ValueError(f"cells: expected a product of at most {LARGEST}, got {math.prod(cells)}")
         self.bounds = tuple(float(b) for b in bounds)
         self.betas = tuple(float(b) for b in betas)
         self.cells = tuple(int(n) for n in cells)
@@ -84,27 +90,37 @@ class NestedGrid:
         return self._at(self.remap(coordinates))
 
     def _at(self, place: Tensor) -> Tensor:
-        """The box that holds a place ``(..., n)`` in grid units."""
-        device = place.device
-        place = torch.minimum(place.clamp_min(0), self._inside(device))
-        level = triangular_root(place.amin(-1))
-        inner = ((place - (level * (level + 1) // 2)[..., None]) / (level + 1)[..., None]).floor().long()
+        """The box that holds a place ``(..., n)`` in grid units: corners of boxes are whole, so that a table tells."""
+        inside = torch.minimum(place.clamp_min(0), self._inside(place.device)).long()
+        flat = inside[..., 0]
+        for axis, count in enumerate(self.cells[1:], 1):
+            flat = flat * count + inside[..., axis]
+        return self._table.to(place.device)[flat]
+
+    @cached_property
+    def _table(self) -> Tensor:
+        """The box of every unit of the grid, flat: `_ranked` of their lower corners."""
+        units = torch.cartesian_prod(*(torch.arange(n) for n in self.cells)).reshape(-1, len(self.cells))
+        return self._ranked(units)
+
+    def _ranked(self, units: Tensor) -> Tensor:
+        """The number of the box that holds whole places ``(M, n)``, in constant time (LKS section 5.2)."""
+        level = triangular_root(units.amin(1))
+        inner = (units - (level * (level + 1) // 2)[:, None]) // (level + 1)[:, None]
         # Boxes of a level have an index of 0 along some axis: first those that have it along axis 0, all others being
         # free; then those that have not, but along axis 1; and so on.
-        counts = torch.tensor(self._counts, device=device)[level]
-        found = torch.tensor(self._first, device=device)[level]
-        before = torch.zeros_like(level)
-        settled = torch.zeros_like(level, dtype=torch.bool)
+        counts, found = torch.tensor(self._counts)[level], torch.tensor(self._first)[level]
+        before, settled = torch.zeros_like(level), torch.zeros_like(level, dtype=torch.bool)
         axes = range(len(self.cells))
         for axis in axes:
             rank, group = torch.zeros_like(level), torch.ones_like(level)
             for other in axes:
                 if other == axis:
                     continue
-                free = counts[..., other] - int(other < axis)
-                rank = rank * free + inner[..., other] - int(other < axis)
+                free = counts[:, other] - int(other < axis)
+                rank = rank * free + inner[:, other] - int(other < axis)
                 group = group * free
-            here = ~settled & (inner[..., axis] == 0)
+            here = ~settled & (inner[:, axis] == 0)
             found = found + torch.where(here, before + rank, 0)
             settled = settled | here
             before = before + group

@@ -26,7 +26,7 @@ def contact_sheet(bank: PsfBank, count: int, tile: int) -> Tensor:
     """Some samples, evenly chosen, one per row.
 
     Columns: the dense pre-filtered PSF; its Laplacian; the points that stand for it; what they integrate to; ten times
-    the difference. Each row has its own scale: white is the maximum of the PSF (or `BRIGHT` times its median), and in the
+    the difference. Each row has its own scale: white is the maximum of the PSF, or `BRIGHT` times its median; in the
     other columns red is positive and blue negative.
 
     Args:

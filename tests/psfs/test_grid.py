@@ -107,6 +107,8 @@ def test_bad_arguments_are_named() -> None:
         NestedGrid((1.0,), (1.0,), (0,))
     with pytest.raises(ValueError, match="cells: expected whole numbers"):
         NestedGrid((1.0,), (1.0,), (2.5,))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="cells: expected a product of at most 16777216, got 25000000"):
+        NestedGrid((1.0, 1.0), (1.0, 1.0), (5000, 5000))
     with pytest.raises(ValueError, match=r"number: expected 0 to 8, got 9"):
         NestedGrid((1.0,), (1.0,), (40,)).box(9)
     with pytest.raises(ValueError, match=r"coordinates: expected shape \(\.\.\., 2\)"):
