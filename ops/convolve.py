@@ -88,6 +88,10 @@ def blur_uniform(values: Tensor, radius: float, profile: Profile) -> Tensor:
     reach = [min(math.ceil(abs(radius) * shape) + 1, n - 1) for n in values.shape[2:]]
     dot = values.new_zeros(1, 1, *(2 * r + 1 for r in reach), dtype=working_dtype(values.device))
     dot[..., reach[0], reach[1]] = 1.0
-    psf = splat_spans(dot, torch.full_like(dot, radius), profile, integrate=True)
+    return blur_with(values, splat_spans(dot, torch.full_like(dot, radius), profile, integrate=True))
+
+
+def blur_with(values: Tensor, psf: Tensor) -> Tensor:
+    """`convolve`, divided by the coverage: arguments, result and errors are the same."""
     coverage = convolve(torch.ones_like(values[:1, :1]), psf)
     return convolve(values, psf) / coverage.clamp_min(TINY)

@@ -62,6 +62,7 @@ class PsfBank(nn.Module):
             raise ValueError(f"samples: expected {len(model.grid)} for {model.name}, got {len(samples)}")
         self.model = model
         self.info = dict(info or {})
+        self._tables: dict[tuple[Domain, int, torch.device], PointTable] = {}
         sizes = [len(s.sparse.points) for s in samples]
         self.register_buffer("offsets", torch.from_numpy(np.concatenate([s.sparse.points for s in samples])).short())
         self.register_buffer("values", torch.from_numpy(np.concatenate([s.sparse.values for s in samples])).float())
@@ -91,11 +92,15 @@ class PsfBank(nn.Module):
 
         Samples of other domains have no points in it.
         """
-        here = self.domains == DOMAINS.index(domain)
-        sizes = self.counts.diff()
-        chosen = here.repeat_interleave(sizes)
-        counts = torch.cat([sizes.new_zeros(1), torch.where(here, sizes, 0).cumsum(0)])
-        return PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts.long())
+        key = domain, channel, self.values.device
+        if key not in self._tables:
+            with torch.inference_mode(False):  # what is kept may be asked for gradients later
+                here = self.domains == DOMAINS.index(domain)
+                sizes = self.counts.diff()
+                chosen = here.repeat_interleave(sizes)
+                counts = torch.cat([sizes.new_zeros(1), torch.where(here, sizes, 0).cumsum(0)]).long()
+                self._tables[key] = PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts)
+        return self._tables[key]
 
     def reach(self) -> Tensor:
         """Largest distance ``(K,)`` in px of a point of each sample from its centre, along x or y."""
@@ -107,8 +112,9 @@ class PsfBank(nn.Module):
     @cached_property
     def extents(self) -> Tensor:
         """`PsfModel.extent` of every sample, ``(K,)`` float64 on the CPU: 1 where the model has none."""
-        found = self.model.extent(self.model.grid.centres())
-        return torch.ones(len(self), dtype=torch.float64) if found is None else found
+        with torch.inference_mode(False):
+            found = self.model.extent(self.model.grid.centres())
+            return torch.ones(len(self), dtype=torch.float64) if found is None else found
 
     def gains(self) -> Tensor:
         """What each sample sums to, ``(K, C)``: 1, but for the fit, unless the model tints.
@@ -179,7 +185,7 @@ class PsfBank(nn.Module):
             raise ValueError(f"{path}: its samples stand elsewhere than those of this version's model {model.name!r}")
         bank = cls.__new__(cls)
         nn.Module.__init__(bank)
-        bank.model, bank.info = model, head["info"]
+        bank.model, bank.info, bank._tables = model, head["info"], {}
         for name, tensor in tensors.items():
             bank.register_buffer(name, tensor)
         return bank

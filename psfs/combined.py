@@ -18,6 +18,9 @@ NODES = 5
 CELLS = 160
 """Boxes of the finest level along each axis."""
 
+FINE = (3, 15)
+"""Least and most samples along each side of a pixel of `turned_capsule`, odd."""
+
 SHARING = 2 / 3
 """What sharing turned points among four pixels adds to the square of a radius: 4 times its mean variance, 1/6."""
 
@@ -57,6 +60,33 @@ def capsule(radius: float, length: float) -> NDArray[np.float64]:
     whole = np.concatenate([half_plane[:0:-1], half_plane])[None]
     whole[whole < 1e-12 * whole.max()] = 0.0  # what rounding left outside
     return whole / whole.sum()  # pi r**2, but for 1e-7 of the quadrature
+
+
+def turned_capsule(radius: float, motion: tuple[float, float], advance: float = 0.0) -> NDArray[np.float64]:
+    """A disc, spread along a displacement in any direction, by samples in each pixel: ``(h, w)``, with a sum of 1.
+
+    Args:
+        radius: of the disc in px, >= 0; below half a pixel it is half a pixel.
+        motion: (dx, dy) in px.
+        advance: by which part of the motion its middle lies ahead of the middle of the picture.
+    """
+    radius = max(radius, MIN_RADIUS)
+    half = math.hypot(*motion) / 2
+    cos, sin = (motion[0] / (2 * half), motion[1] / (2 * half)) if half > 0 else (1.0, 0.0)
+    reach = [math.ceil(radius + (0.5 + abs(advance)) * abs(d)) + 1 for d in motion]
+    fine = int(np.clip(24 / radius, *FINE)) | 1
+    x, y = (
+        np.arange(-r * fine - fine // 2, r * fine + fine // 2 + 1) / fine - advance * d
+        for r, d in zip(reach, motion, strict=True)
+    )
+    along, across = x * cos + y[:, None] * sin, y[:, None] * cos - x * sin
+    chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+    if half < 1e-3:
+        light = (np.abs(along) <= chord) & (chord > 0)
+    else:
+        light = np.maximum(np.minimum(along + half, chord) - np.maximum(along - half, -chord), 0.0)
+    pixels = light.reshape(2 * reach[1] + 1, fine, 2 * reach[0] + 1, fine).sum((1, 3), dtype=np.float64)
+    return pixels / pixels.sum()
 
 
 def _running(x: NDArray[np.float64], chord: NDArray[np.float64], half: float) -> NDArray[np.float64]:

@@ -72,16 +72,15 @@ class NestedGrid:
 
     def remap(self, coordinates: Tensor) -> Tensor:
         """Coordinates ``(..., n)`` to grid units ``[0, N]``; what lies outside the bounds goes to their border."""
-        share = coordinates.double() / torch.tensor(self.bounds, dtype=torch.float64, device=coordinates.device)
-        powers = torch.tensor(self.betas, dtype=torch.float64, device=coordinates.device).reciprocal()
-        scale = torch.tensor(self.cells, dtype=torch.float64, device=coordinates.device)
-        return share.clamp(0, 1) ** powers * scale
+        given = coordinates.to(torch.promote_types(coordinates.dtype, torch.float32))
+        bounds, betas, cells = (given.new_tensor(values) for values in (self.bounds, self.betas, self.cells))
+        return (given / bounds).clamp(0, 1) ** betas.reciprocal() * cells
 
     def unmap(self, place: Tensor) -> Tensor:
         """The inverse of `remap`, within the bounds."""
-        share = place.double() / torch.tensor(self.cells, dtype=torch.float64, device=place.device)
-        powers = torch.tensor(self.betas, dtype=torch.float64, device=place.device)
-        return share**powers * torch.tensor(self.bounds, dtype=torch.float64, device=place.device)
+        place = place.double()
+        bounds, betas, cells = (place.new_tensor(values) for values in (self.bounds, self.betas, self.cells))
+        return (place / cells) ** betas * bounds
 
     def index(self, coordinates: Tensor) -> Tensor:
         """The number ``(...)`` of the box that holds coordinates ``(..., n)``, int64: the forward mapping g of LKS."""
@@ -91,7 +90,8 @@ class NestedGrid:
 
     def _at(self, place: Tensor) -> Tensor:
         """The box that holds a place ``(..., n)`` in grid units: corners of boxes are whole, so that a table tells."""
-        inside = torch.minimum(place.clamp_min(0), self._inside(place.device)).long()
+        top = torch.tensor(self.cells, device=place.device) - 1
+        inside = torch.minimum(place.clamp_min(0).long(), top)
         flat = inside[..., 0]
         for axis, count in enumerate(self.cells[1:], 1):
             flat = flat * count + inside[..., axis]
@@ -139,7 +139,7 @@ class NestedGrid:
         Returns:
             Pairs of numbers ``(...)`` and shares ``(...)``, float64.
         """
-        place = torch.minimum(self.remap(coordinates), self._inside(coordinates.device))
+        place = torch.minimum(self.remap(coordinates).double(), self._inside(coordinates.device))
         own = self._at(place.detach())
         corners = torch.tensor(self.boxes(), dtype=torch.float64, device=coordinates.device)
         low, high = corners[own].unbind(-2)

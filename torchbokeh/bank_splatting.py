@@ -191,22 +191,24 @@ def _splat_samples(values: Tensor, index: Tensor, place: Place, bank: PsfBank) -
         count = bank.values.shape[1]
         gains = bank.gains()[index[:, 0]].movedim(-1, 1).clamp_min(TINY)
         values = torch.cat([values[:, :-count], values[:, -count:] / gains], 1)
-    domains = bank.domains.long()[index]
-    reach = bank.reach()[index] * (1.0 if place.scale is None else place.scale.detach())
-    if place.frame is not None:
-        reach = reach * math.sqrt(2)  # turned by 45 degrees
-    if place.offset is not None:
-        reach = reach + place.offset.detach().abs().amax(1, keepdim=True)
-    alive = (values.detach() != 0).any(1, keepdim=True)
     out = torch.zeros_like(values)
+    if not bool(values.detach().any()):
+        return out
+    used = index.flatten().bincount(minlength=len(bank)) > 0
+    # Turned by 45 degrees, a point on a corner lies farther away along an axis.
+    stretch = 1.0 if place.frame is None else math.sqrt(2)
+    if place.scale is not None:
+        stretch = stretch * float(place.scale.detach().max())
+    shift = 0.0 if place.offset is None else float(place.offset.detach().abs().max())
+    reach, domains = bank.reach(), bank.domains
     for number, domain in enumerate(DOMAINS):
-        here = (domains == number) & alive
+        here = used & (domains == number)
         if not bool(here.any()):
             continue
-        pad = math.ceil(float(reach[here].max())) + ROOM
-        source = torch.where(here, values, 0.0)
+        pad = math.ceil(float(reach[here].max()) * stretch + shift) + ROOM
+        source = values
         if domain == "laplacian" and place.scale is not None:
-            source = source / place.scale.square()
+            source = values / place.scale.square()
         whole = _INTEGRALS[domain](_splat_channels(source, index, bank, domain, pad, place))
         out = out + whole[..., pad : pad + values.shape[2], pad : pad + values.shape[3]]
     return out

@@ -23,18 +23,19 @@ from torchbokeh.layers import (
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
-from torchbokeh.ops.convolve import blur_uniform
+from torchbokeh.ops.convolve import blur_uniform, blur_with
 from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan, Seen
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.combined import STILL
+from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
 ADVANCE = {"centre": 0.0, "start": 0.5}
 """Moments that a picture may show, and the part of its motion by which the middle of the exposure is ahead."""
 
+Moves = tuple[float, tuple[float, float] | None]
 Background = Tensor | tuple[Tensor, Tensor] | None
 
 
@@ -126,27 +127,28 @@ class LensBlur(nn.Module):
         One small copy from the device, which a forward pass with ``plan=`` saves.
         """
         _, signed, cut = self._inputs(image, depth, coc, background)
-        longest = self._longest(image, motion)
-        return self._plan(image, signed, cut, longest, background is not None)
+        return self._plan(image, signed, cut, self._moves(image, motion), background is not None)
 
-    def _longest(self, image: Tensor, motion: Tensor | None) -> float:
-        """Check the motion; return the largest displacement in px."""
-        if motion is None:
-            return 0.0
+    def _moves(self, image: Tensor, motion: Tensor | None) -> Moves:
+        """Check the motion; return the largest displacement in px, and the one that all pixels share."""
+        if motion is None or motion.numel() == 0:
+            return 0.0, None
         check_image("motion", motion, (*image.shape[:-3], 2, *image.shape[-2:]), like=image)
         if not isinstance(self.aperture, Disc):
             raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
-        longest = float(motion.detach().norm(dim=-3).max()) if motion.numel() else 0.0
+        components = motion.detach().movedim(-3, 0).flatten(1)
+        ends = torch.stack([*components.aminmax(dim=1), components.norm(dim=0).max().expand(2)])
+        (x, y), (x1, y1), (longest, _) = ends.tolist()
         if not math.isfinite(longest):
             raise ValueError(f"motion: expected finite values, got {int((~motion.isfinite()).sum())} that are not")
-        return longest
+        return longest, (x, y) if (x, y) == (x1, y1) else None
 
-    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, longest: float, background: bool) -> Plan:
+    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves, background: bool) -> Plan:
         with torch.no_grad():
             if image.numel() == 0:
                 raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
             if image.dim() == 5:
-                return self._plan_layers(image, signed, cut, longest)
+                return self._plan_layers(image, signed, cut, moves)
             *_, height, width = image.shape
             share = signed.new_zeros(()) if cut is None else cut.to(signed.dtype).mean()
             look = [*signed.aminmax(), share, *self._shares(signed)]
@@ -164,13 +166,13 @@ class LensBlur(nn.Module):
             else:
                 bins = (bin_centres(low, high, most),)
             occludes = in_front or len(bins[0]) > 1
-            seen = Seen((height, width), (low, high), clamped, longest, 0, (), ())
+            seen = Seen((height, width), (low, high), clamped, *moves, 0, (), ())
             return self._finish(seen, hidden, bins, occludes, quality, error)
 
     def _shares(self, signed: Tensor) -> list[Tensor]:
         return merged_shares(signed, self.quality, self.tolerance)
 
-    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None, longest: float) -> Plan:
+    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves) -> Plan:
         *_, height, width = image.shape
         held = image[:, :, 3:] > 0
         low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
@@ -188,7 +190,7 @@ class LensBlur(nn.Module):
         bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
         span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
         occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        seen = Seen((height, width), span, clamped, longest, count, kept, opaque)
+        seen = Seen((height, width), span, clamped, *moves, count, kept, opaque)
         return self._finish(seen, "layers", bins, occludes, quality, error)
 
     def _finish(
@@ -250,11 +252,12 @@ class LensBlur(nn.Module):
         if image.numel() == 0:
             return image.clone() if image.dim() == 4 else image.sum(1)
         if plan is None:
-            plan = self._plan(image, signed, cut, self._longest(image, motion), background is not None)
+            plan = self._plan(image, signed, cut, self._moves(image, motion), background is not None)
         self._check_plan(plan, image, motion, background)
         moving = self._moving(plan, image, motion)
         if plan.sharp and not signed.requires_grad:
             return image.clone()
+        asked = signed.requires_grad or (motion is not None and motion.requires_grad)
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
@@ -276,8 +279,8 @@ class LensBlur(nn.Module):
                     if surfaces
                     else torch.zeros_like(source[:, 0])
                 )
-            elif moving is None and plan.uniform is not None and not signed.requires_grad:
-                out = blur_uniform(source, plan.uniform, self.aperture.profile())
+            elif plan.uniform is not None and not asked:
+                out = self._convolved(source, plan, plan.uniform)
             elif len(plan.bins) == 2:
                 out = self._over_rest(source, radii, behind, plan, pieces, moving)
             elif moving is None and len(plan.bins[0]) == 1 and len(pieces) == 1:
@@ -285,6 +288,12 @@ class LensBlur(nn.Module):
             else:
                 out, _ = compose([Surface(source, None, radii, plan.bins[0], moving)], pieces, merging, plan.highest)
         return out.to(image.dtype)
+
+    def _convolved(self, image: Tensor, plan: Plan, radius: float) -> Tensor:
+        if not plan.moves or plan.pan is None:
+            return blur_uniform(image, radius, self.aperture.profile())
+        psf = torch.from_numpy(turned_capsule(abs(radius), plan.pan, ADVANCE[self.shutter]))
+        return blur_with(image, psf[None, None].to(image))
 
     def _over_rest(
         self,
@@ -353,7 +362,8 @@ class LensBlur(nn.Module):
 @lru_cache(maxsize=4)
 def bank_of_motion(device: torch.device) -> PsfBank:
     """The bank of `torchbokeh.psfs.Combined` that comes with the package."""
-    return PsfBank.load("combined").to(device)
+    with torch.inference_mode(False):  # it is kept, and may be asked for gradients later
+        return PsfBank.load("combined").to(device)
 
 
 def _count(name: str, value: int | str) -> int | None:

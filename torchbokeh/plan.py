@@ -22,6 +22,7 @@ class Seen(NamedTuple):
     coc_range: tuple[float, float]
     clamped: float
     motion: float
+    pan: tuple[float, float] | None
     layer_count: int
     layers: tuple[int, ...]
     opaque: tuple[int, ...]
@@ -36,6 +37,7 @@ class Plan:
         coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
         clamped: share of the pixels whose radius ``max_coc`` cut.
         motion: longest displacement in px over the open shutter.
+        pan: the displacement (dx, dy) that all pixels share; None where they do not.
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
         opaque: indices of those that cover everything: their coverage needs no looking at.
@@ -53,6 +55,7 @@ class Plan:
     coc_range: tuple[float, float]
     clamped: float
     motion: float
+    pan: tuple[float, float] | None
     layer_count: int
     layers: tuple[int, ...]
     opaque: tuple[int, ...]
@@ -74,8 +77,11 @@ class Plan:
     def uniform(self) -> float | None:
         """The signed radius in px that all pixels share, where one convolution does it; else None."""
         low, high = self.coc_range
-        alone = self.hidden == "nothing" and self.highest == 0 and not self.moves
-        return low if alone and low == high and abs(low) >= CONVOLVE_FROM else None
+        if low != high or self.hidden != "nothing":
+            return None
+        if self.moves:
+            return low if self.pan is not None else None
+        return low if self.highest == 0 and abs(low) >= CONVOLVE_FROM else None
 
     def __str__(self) -> str:
         height, width = self.size
@@ -84,7 +90,8 @@ class Plan:
         if self.sharp:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
         if self.uniform is not None:
-            return f"{head}\nEvery pixel has the same PSF ({self.aperture}): a single convolution."
+            moved = f", moved by ({self.pan[0]:.1f}, {self.pan[1]:.1f}) px" if self.moves and self.pan else ""
+            return f"{head}\nEvery pixel has the same PSF ({self.aperture}{moved}): a single convolution."
         lines = [head]
         counts = " and ".join(str(len(b)) for b in self.bins)
         if self.hidden == "layers":

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import torchbokeh.psfs.combined
 import torchbokeh.psfs.simple_lens
-from torchbokeh.psfs.combined import SHARING, Combined, capsule
+from torchbokeh.psfs.combined import SHARING, Combined, capsule, turned_capsule
 from torchbokeh.psfs.model import FRAME, Labels
 from torchbokeh.psfs.similarity import centred
 from torchbokeh.psfs.simple_lens import SimpleLens
@@ -156,3 +156,20 @@ def test_prefiltering_is_a_mean_over_shapes_of_one_size() -> None:
 def test_examples() -> None:
     for module in (torchbokeh.psfs.combined, torchbokeh.psfs.simple_lens):
         assert doctest.testmod(module).failed == 0
+
+
+@pytest.mark.parametrize(("radius", "length"), [(6.0, 20.0), (0.5, 15.0), (2.0, 7.0), (30.0, 40.0)])
+def test_a_turned_capsule_is_a_capsule(radius: float, length: float) -> None:
+    straight = capsule(radius, length)[0]
+    for motion, want in (((length, 0.0), straight), ((0.0, -length), straight.T)):
+        got = turned_capsule(radius, motion)
+        assert got.sum() == pytest.approx(1)
+        assert np.abs(centred(got[None], want.shape)[0] - want).sum() < 0.02
+    oblique = turned_capsule(radius, (0.6 * length, -0.8 * length))
+    y, x = np.indices(oblique.shape) - np.array(oblique.shape)[:, None, None] // 2
+    assert (oblique * (0.6 * x - 0.8 * y) ** 2).sum() == pytest.approx(radius**2 / 4 + length**2 / 12, rel=0.01, abs=0.1)
+    assert abs((oblique * x).sum()) + abs((oblique * y).sum()) < 1e-9
+    ahead = turned_capsule(radius, (0.6 * length, -0.8 * length), 0.5)
+    y, x = np.indices(ahead.shape) - np.array(ahead.shape)[:, None, None] // 2
+    assert [(ahead * x).sum(), (ahead * y).sum()] == pytest.approx([0.3 * length, -0.4 * length], abs=0.05)
+    assert turned_capsule(0.0, (0.0, 0.0)).max() == pytest.approx(1, abs=0.3)

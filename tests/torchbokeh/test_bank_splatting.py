@@ -111,6 +111,17 @@ def test_it_is_linear_and_its_gradient_is_the_adjoint(bank: PsfBank) -> None:
     torch.testing.assert_close((grad * other).sum(), (aim * splat_bank(other, labels, bank)).sum())
 
 
+def test_what_is_kept_from_inference_can_be_trained_with() -> None:
+    with torch.inference_mode():
+        bank = PsfBank.load("combined")
+        values, labels = mixed(9, 10, 4.0, 9.0, dtype=torch.float32)
+        splat_bank(values, labels, bank)
+    values, labels = mixed(9, 10, 4.0, 9.0, dtype=torch.float32)
+    asked = [t.clone().requires_grad_() for t in (values, labels.coc, labels.motion)]
+    splat_bank(asked[0], Labels(coc=asked[1], motion=asked[2]), bank).square().sum().backward()
+    assert all(t.grad.isfinite().all() for t in asked)
+
+
 def test_with_interpolation_gradients_reach_radius_and_motion(bank: PsfBank) -> None:
     values, labels = mixed(9, 10, 4.0, 9.0, seed=4)
     aim = torch.rand_like(values)

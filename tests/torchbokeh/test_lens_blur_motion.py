@@ -45,7 +45,11 @@ def test_what_stands_still_needs_no_motion(quality: str, coc: Tensor) -> None:
 def test_little_motion_changes_little() -> None:
     blur, image, coc = LensBlur(subapertures=1, layers=1), picture(), halves(3, 3)
     still = blur(image, coc=coc)
-    step = [(blur(image, coc=coc, motion=constant(x, 0.0)) - still).abs().mean().item() for x in (0.51, 0.7, 1.0, 1.3)]
+    uneven = 1e-4 * torch.rand(1, 2, H, W, generator=draw(1))
+    step = [
+        (blur(image, coc=coc, motion=constant(x, 0.0) + uneven) - still).abs().mean().item()
+        for x in (0.51, 0.7, 1.0, 1.3)
+    ]
     assert all(a < b for a, b in pairwise(step))
     assert step[0] < 1e-4
     assert step[-1] < 5e-3
@@ -155,6 +159,27 @@ def test_it_is_near_the_truth(recipe: str, image_ssim: float, layers_ssim: float
     assert ssim[0] > image_ssim
     assert ssim[1] > layers_ssim
     assert ssim[2] < ssim[1] - 0.03
+
+
+@pytest.mark.parametrize("shutter", ["centre", "start"])
+@pytest.mark.parametrize("radius", [0.0, -6.0])
+def test_a_pan_at_one_depth_is_a_single_convolution(shutter: str, radius: float) -> None:
+    blur, image, coc, motion = LensBlur(shutter=shutter), picture(), halves(radius, radius), constant(11.0, 7.0)
+    plan = blur.plan(image, coc=coc, motion=motion)
+    assert plan.uniform == radius
+    assert "moved by (11.0, 7.0) px): a single convolution." in str(plan)
+    out = blur(image, coc=coc, motion=motion)
+    splatted = blur(image, coc=coc, motion=motion.clone().requires_grad_()).detach()
+    assert float((out - splatted).abs().mean()) < 0.02
+    dot = torch.zeros(1, 1, H, W)
+    dot[..., H // 2, W // 2] = 1
+    place = (blur(dot, coc=coc, motion=motion)[0, 0] * torch.arange(W)).sum() - W // 2
+    assert place.item() == pytest.approx(5.5 if shutter == "start" else 0.0, abs=0.1)
+    assert (
+        blur.plan(image, coc=coc, motion=motion + (coc.new_zeros(1, 2, H, W).index_fill(3, torch.tensor(0), 1))).uniform
+        is None
+    )
+    assert blur.plan(image, coc=halves(radius, radius + 1), motion=motion).uniform is None
 
 
 def test_the_plan_says_that_things_move() -> None:
