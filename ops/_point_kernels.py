@@ -139,15 +139,26 @@ def _bands(height: int) -> list[tuple[int, int]]:
     return [(y, min(y + rows, height)) for y in range(0, height, rows)]
 
 
+def _reaches(points: Tensor, counts: Tensor, turned: bool) -> Tensor:
+    """How far each PSF ``(K,)`` of a table reaches: in rows, or in any direction if it is turned."""
+    far = points[:, :2].norm(dim=1) if turned else points[:, 1].abs()
+    owner = torch.arange(len(counts) - 1).repeat_interleave(counts.diff())
+    return far.new_zeros(len(counts) - 1).scatter_reduce(0, owner, far, "amax")
+
+
 def _row_range(
-    low: float, high: float, points: Tensor, rotation: Tensor | None, position: Tensor | None
+    low: float, high: float, far: Tensor, rotation: Tensor | None, position: Tensor | None
 ) -> tuple[int, int]:
-    """First row that source rows ``low .. high`` of one image reach and one past the last, in the unpadded image."""
-    extent = torch.nn.functional.pad(points[:, :2].abs(), (0, 0, 0, 1)).amax(0)
-    reach = extent[1] if rotation is None else (rotation[1].abs().amax((1, 2)) * extent).sum()
+    """First row that source rows ``low .. high`` of one image reach and one past the last, in the unpadded image.
+
+    ``far`` is what `_reaches` says of the PSFs of their pixels.
+    """
+    reach = float(far.max())
+    if rotation is not None:
+        reach *= float(rotation[1].norm(dim=0).max())
     if position is not None:
         low, high = position[1].min().item(), position[1].max().item()
-    return math.floor(low - float(reach)), math.floor(high + float(reach)) + 2
+    return math.floor(low - reach), math.floor(high + reach) + 2
 
 
 def _is_whole(points: Tensor, rotation: Tensor | None, position: Tensor | None, pad: int) -> bool:
@@ -190,13 +201,15 @@ def splat_points(
     src = interleave(values).flatten(1).numpy()
     kernel = _splat_whole if _is_whole(points, rotation, position, pad) else _splat_between
     tables = _tables(index, points, counts, rotation, position, pad)
+    reaches = _reaches(points, counts, rotation is not None)
     out = torch.empty(b * groups, 4, rows, columns, dtype=torch.float32)
     for k in range(b * groups):
         n = k // groups
         pieces = []
         for y0, y1 in _bands(h):
             near = [None if t is None else t[n, ..., y0:y1, :] for t in (rotation, position)]
-            first, end = (min(max(y + pad, 0), rows) for y in _row_range(y0, y1 - 1, points, *near))
+            far = reaches[index[n, 0, y0:y1]]
+            first, end = (min(max(y + pad, 0), rows) for y in _row_range(y0, y1 - 1, far, *near))
             buffer = np.zeros((end - first + 2, columns + 2, 4))
             pieces.append((src[k], *tables[n], pad, y0, y1, first, buffer))
         run_all(kernel, pieces)

@@ -20,6 +20,7 @@ PICTURES = {  # name, size, frames
     "scenes.py": ("new/a.png", (128, 192), 1),
     "operating_points.py": ("new/a.png", (148, 100), 1),
     "logo_bokeh.py": ("new/a.png", (80, 48), 1),
+    "reconstruct.py": ("new/a.png", (192, 32), 1),
 }
 
 

@@ -18,7 +18,8 @@ from torchbokeh.kernel_splatting import KernelSplatting, SplattingPlan
 from torchbokeh.lens import DisparityLens, Lens, ThinLens
 from torchbokeh.lens_blur import LensBlur
 from torchbokeh.plan import Plan
-from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
+from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon, PsfBank
+from torchbokeh.reconstruction import Samples, pinhole_position, reconstruct
 
 __version__ = "0.1.0"
 
@@ -34,9 +35,13 @@ __all__ = [
     "LensBlur",
     "Plan",
     "Polygon",
+    "PsfBank",
     "PyramidIntegrator",
+    "Samples",
     "ScanlineIntegrator",
     "SplattingPlan",
     "ThinLens",
+    "pinhole_position",
+    "reconstruct",
     "scenes",
 ]

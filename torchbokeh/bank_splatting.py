@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -25,6 +26,13 @@ _INTEGRALS: dict[Domain, Callable[[Tensor], Tensor]] = {
 
 ROOM = 2
 """Pixels around the farthest points: what is shared with a neighbour, and the ring on which the picture vanishes."""
+
+
+@lru_cache(maxsize=4)
+def bank_of_motion(device: torch.device) -> PsfBank:
+    """The bank of `torchbokeh.psfs.Combined` that comes with the package."""
+    with torch.inference_mode(False):  # it is kept, and may be asked for gradients later
+        return PsfBank.load("combined").to(device)
 
 
 def bank_labels(
@@ -142,12 +150,12 @@ def splat_bank(
     def splat(cells: Tensor, radius: Tensor | None, now: Labels, size: int) -> Tensor:
         still = bank.model.still(now)
         if still is None or radius is None:
-            return _splat_places(cells, places(now, size), bank, interpolate)
+            return splat_places(cells, places(now, size), bank, interpolate)
         discs = splat_spans(cells * still, radius, Disc().profile(), integrate=True)
         moving = cells * (1 - still)
         if not bool((still < 1).any()):
             return discs
-        return discs + _splat_places(moving, places(now, size), bank, interpolate)
+        return discs + splat_places(moving, places(now, size), bank, interpolate)
 
     if merging is None or highest == 0:
         return splat(values, labels.coc, labels, 1)
@@ -167,7 +175,8 @@ def needed(labels: Labels) -> Tensor:
     return labels.coc
 
 
-def _splat_places(values: Tensor, places: Sequence[Place], bank: PsfBank, interpolate: bool) -> Tensor:
+def splat_places(values: Tensor, places: Sequence[Place], bank: PsfBank, interpolate: bool = False) -> Tensor:
+    """Splat ``(B, C, H, W)`` with the PSFs at places, each pixel with all of them. See `splat_bank`."""
     out = torch.zeros_like(values)
     for place in places:
         source = values if place.share is None else values * place.share

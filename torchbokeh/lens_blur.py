@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from numbers import Real
 
 import torch
 from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc, signed_map
+from torchbokeh.bank_splatting import bank_of_motion
 from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
@@ -28,7 +28,6 @@ from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan, Seen
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
@@ -357,13 +356,6 @@ class LensBlur(nn.Module):
             raise ValueError(f"plan: expected one for {count} layers, got one for {plan.layer_count}")
         if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (background is not None):
             raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
-
-
-@lru_cache(maxsize=4)
-def bank_of_motion(device: torch.device) -> PsfBank:
-    """The bank of `torchbokeh.psfs.Combined` that comes with the package."""
-    with torch.inference_mode(False):  # it is kept, and may be asked for gradients later
-        return PsfBank.load("combined").to(device)
 
 
 def _count(name: str, value: int | str) -> int | None:

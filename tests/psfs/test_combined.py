@@ -167,7 +167,9 @@ def test_a_turned_capsule_is_a_capsule(radius: float, length: float) -> None:
         assert np.abs(centred(got[None], want.shape)[0] - want).sum() < 0.02
     oblique = turned_capsule(radius, (0.6 * length, -0.8 * length))
     y, x = np.indices(oblique.shape) - np.array(oblique.shape)[:, None, None] // 2
-    assert (oblique * (0.6 * x - 0.8 * y) ** 2).sum() == pytest.approx(radius**2 / 4 + length**2 / 12, rel=0.01, abs=0.1)
+    assert (oblique * (0.6 * x - 0.8 * y) ** 2).sum() == pytest.approx(
+        radius**2 / 4 + length**2 / 12, rel=0.01, abs=0.1
+    )
     assert abs((oblique * x).sum()) + abs((oblique * y).sum()) < 1e-9
     ahead = turned_capsule(radius, (0.6 * length, -0.8 * length), 0.5)
     y, x = np.indices(ahead.shape) - np.array(ahead.shape)[:, None, None] // 2

@@ -3,6 +3,7 @@
 from torchbokeh.scenes import shapes, textures
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.dataset import ProceduralDataset
+from torchbokeh.scenes.ray_samples import samples
 from torchbokeh.scenes.recipes import RECIPES, coins, fence, gears, rain, ramp, sky, stack, whirl
 from torchbokeh.scenes.scene import Scene
 from torchbokeh.scenes.shards import read_shards, write_shards
@@ -21,6 +22,7 @@ __all__ = [
     "rain",
     "ramp",
     "read_shards",
+    "samples",
     "shapes",
     "sky",
     "stack",

@@ -1,0 +1,58 @@
+"""A picture of one ray per pixel, its reconstruction, what non-local means make of it, and the truth, side by side."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import torchbokeh as tb
+from torchbokeh.image_io import write_image
+from torchbokeh.reconstruction import reconstruct
+from torchbokeh.report.measure import displayed, errors
+from torchbokeh.scenes import samples
+
+STRENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4)
+
+
+def ssim(image: torch.Tensor, truth: torch.Tensor) -> float:
+    """SSIM of displayed values."""
+    found = errors(image, truth, flip=False)["ssim"]
+    assert found is not None
+    return found
+
+
+def non_local_means(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """The best that non-local means make of the displayed picture, whatever the strength."""
+    from skimage.restoration import denoise_nl_means
+
+    shown = displayed(image)
+    tried = (denoise_nl_means(shown, patch_size=5, h=h, channel_axis=2) for h in STRENGTHS)
+    linear = (torch.from_numpy(np.clip(t, 0, 1) ** 2.2).permute(2, 0, 1)[None] for t in tried)
+    return max(linear, key=lambda t: ssim(t, truth))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("recipe", nargs="?", choices=tb.scenes.RECIPES, default="whirl")
+    parser.add_argument("--out", type=Path, default=Path("out/reconstruct.png"))
+    parser.add_argument("--samples", type=int, default=1, help="rays per pixel")
+    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--tiny", action="store_true", help="small, for tests")
+    args = parser.parse_args()
+
+    size, views = ((32, 48), 64) if args.tiny else ((256, 256), 2048)
+    scene, camera = tb.scenes.RECIPES[args.recipe](args.seed, size)
+    truth = tb.AccumulationBuffer(views=views)(scene, camera)[:, :3]
+    noisy = samples(scene, camera, args.samples, args.seed)
+    mean = noisy.colour.mean(1)
+    pictures = {"input": mean, "ours": reconstruct(noisy), "non-local means": non_local_means(mean, truth)}
+    for name, picture in pictures.items():
+        print(f"{args.recipe}, {name}: SSIM {ssim(picture, truth):.3f}")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    write_image(args.out, torch.cat([*pictures.values(), truth], 3))
+    print(args.out)
+
+
+if __name__ == "__main__":
+    main()
