@@ -141,7 +141,8 @@ def _bands(height: int) -> list[tuple[int, int]]:
 
 def _reaches(points: Tensor, counts: Tensor, turned: bool) -> Tensor:
     """How far each PSF ``(K,)`` of a table reaches: in rows, or in any direction if it is turned."""
-    far = points[:, :2].norm(dim=1) if turned else points[:, 1].abs()
+    x, y = points[:, 0], points[:, 1]
+    far = (x * x + y * y).sqrt() if turned else y.abs()
     owner = torch.arange(len(counts) - 1).repeat_interleave(counts.diff())
     return far.new_zeros(len(counts) - 1).scatter_reduce(0, owner, far, "amax")
 
@@ -155,7 +156,8 @@ def _row_range(
     """
     reach = float(far.max())
     if rotation is not None:
-        reach *= float(rotation[1].norm(dim=0).max())
+        across, down = rotation[1]
+        reach *= math.sqrt(float((across * across + down * down).max()))
     if position is not None:
         low, high = position[1].min().item(), position[1].max().item()
     return math.floor(low - reach), math.floor(high + reach) + 2
