@@ -40,6 +40,23 @@ def dense_capsules(image: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
     return total[:, :3] / total[:, 3:]
 
 
+def filter_capsules(image: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
+    """The filter of LKS: every pixel is the mean of the picture under its own capsule, as if all around were like it.
+
+    Arguments and result are those of `dense_capsules`.
+    """
+    height, width = image.shape[2:]
+    radii = coc.abs()[0, 0].clamp_min(MIN_RADIUS)
+    reach = math.ceil(float((radii + motion[0].norm(dim=0) / 2).max())) + 1
+    source = torch.cat([image[0], torch.ones_like(radii)[None]]).permute(1, 2, 0).contiguous().numpy()
+    out = np.empty((height, width, 4), np.float32)
+    maps = source, radii.numpy(), motion[0].contiguous().numpy()
+    threads = torch.get_num_threads()
+    run_all(_gather, [(*maps, reach, k, threads, out) for k in range(threads)])
+    total = torch.from_numpy(out).permute(2, 0, 1)[None]
+    return total[:, :3] / total[:, 3:]
+
+
 @nb.njit(nogil=True, fastmath=True, cache=True)
 def _density(along, across, radius, half):  # type: ignore[no-untyped-def]
     """Light of a capsule at a place, not normalised."""
@@ -53,44 +70,75 @@ def _density(along, across, radius, half):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(nogil=True, fastmath=True, cache=True)
+def _draw(radius, dx, dy, weights):  # type: ignore[no-untyped-def]
+    """Light of a capsule in the pixels around, row by row; returns their sum, and how far they reach each way."""
+    length = math.sqrt(dx * dx + dy * dy)
+    half = length / 2
+    cos, sin = (dx / length, dy / length) if length > 1e-6 else (1.0, 0.0)
+    wide, high = int(abs(cos) * half + radius + 1), int(abs(sin) * half + radius + 1)
+    fine = FINE if radius < THIN else 1
+    total, k = 0.0, 0
+    for v in range(-high, high + 1):
+        for u in range(-wide, wide + 1):
+            found = 0.0
+            for i in range(fine):
+                b = v + (i + 0.5) / fine - 0.5
+                for j in range(fine):
+                    a = u + (j + 0.5) / fine - 0.5
+                    found += _density(a * cos + b * sin, b * cos - a * sin, radius, half)
+            weights[k] = found
+            total += found
+            k += 1
+    return total, wide, high
+
+
+@nb.njit(nogil=True, fastmath=True, cache=True)
 def _scatter(src, radii, motion, reach, first, stride, out):  # type: ignore[no-untyped-def]
     """Rows ``first, first + stride, ...`` of ``src (H, W, 4)`` into ``out``."""
     height, width = radii.shape
-    side = 2 * reach + 1
-    weights = np.empty(side * side, np.float32)
+    weights = np.empty((2 * reach + 1) ** 2, np.float32)
     for y in range(first, height, stride):
         for x in range(width):
-            radius, dx, dy = radii[y, x], motion[0, y, x], motion[1, y, x]
-            length = math.sqrt(dx * dx + dy * dy)
-            half = length / 2
-            cos, sin = (dx / length, dy / length) if length > 1e-6 else (1.0, 0.0)
-            wide = int(abs(cos) * half + radius + 1)
-            high = int(abs(sin) * half + radius + 1)
-            fine = FINE if radius < THIN else 1
-            total, k = 0.0, 0
-            for v in range(-high, high + 1):
-                for u in range(-wide, wide + 1):
-                    found = 0.0
-                    for i in range(fine):
-                        b = v + (i + 0.5) / fine - 0.5
-                        for j in range(fine):
-                            a = u + (j + 0.5) / fine - 0.5
-                            found += _density(a * cos + b * sin, b * cos - a * sin, radius, half)
-                    weights[k] = found
-                    total += found
-                    k += 1
+            total, wide, high = _draw(radii[y, x], motion[0, y, x], motion[1, y, x], weights)
             scale = 1.0 / total
-            r, g, b4, c = src[y, x, 0] * scale, src[y, x, 1] * scale, src[y, x, 2] * scale, src[y, x, 3] * scale
+            red, green, blue, one = (
+                src[y, x, 0] * scale,
+                src[y, x, 1] * scale,
+                src[y, x, 2] * scale,
+                src[y, x, 3] * scale,
+            )
             k = 0
-            for v in range(-high, high + 1):
-                if y + v < 0 or y + v >= height:
+            for v in range(y - high, y + high + 1):
+                if v < 0 or v >= height:
                     k += 2 * wide + 1
                     continue
-                for u in range(-wide, wide + 1):
-                    if 0 <= x + u < width:
+                for u in range(x - wide, x + wide + 1):
+                    if 0 <= u < width:
                         w = weights[k]
-                        out[y + v, x + u, 0] += w * r
-                        out[y + v, x + u, 1] += w * g
-                        out[y + v, x + u, 2] += w * b4
-                        out[y + v, x + u, 3] += w * c
+                        out[v, u, 0] += w * red
+                        out[v, u, 1] += w * green
+                        out[v, u, 2] += w * blue
+                        out[v, u, 3] += w * one
                     k += 1
+
+
+@nb.njit(nogil=True, fastmath=True, cache=True)
+def _gather(src, radii, motion, reach, first, stride, out):  # type: ignore[no-untyped-def]
+    """Rows ``first, first + stride, ...`` of ``out (H, W, 4)`` from all of ``src``."""
+    height, width = radii.shape
+    weights = np.empty((2 * reach + 1) ** 2, np.float32)
+    for y in range(first, height, stride):
+        for x in range(width):
+            _, wide, high = _draw(radii[y, x], motion[0, y, x], motion[1, y, x], weights)
+            red = green = blue = one = 0.0
+            k = 0
+            for v in range(y - high, y + high + 1):
+                for u in range(x - wide, x + wide + 1):
+                    if 0 <= v < height and 0 <= u < width:
+                        w = weights[k]
+                        red += w * src[v, u, 0]
+                        green += w * src[v, u, 1]
+                        blue += w * src[v, u, 2]
+                        one += w * src[v, u, 3]
+                    k += 1
+            out[y, x, 0], out[y, x, 1], out[y, x, 2], out[y, x, 3] = red, green, blue, one

@@ -1,7 +1,10 @@
-"""Defocus with motion on one layer: splats from the bank beside a dense scatter of every capsule."""
+"""Defocus with motion: splats from the bank beside a dense scatter of every capsule, and the tables of LKS."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,12 +12,21 @@ import torchbokeh
 from torchbokeh.ops._dispatch import numba_is_there
 from torchbokeh.psfs import PsfBank
 from torchbokeh.report.experiments import Row, Say
-from torchbokeh.report.measure import Work, errors, measure
+from torchbokeh.report.measure import Work, displayed, errors, measure
 from torchbokeh.report.methods import QUALITIES
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
+from torchbokeh.scenes import RECIPES, samples
 
 DENSE = "dense scatter of capsules"
+
+FILTER = "filter with capsules"
+
+RECIPES_IN_MOTION = ("whirl", "coins", "rain", "gears")
+"""Recipes that go by the names of the scenes of LKS."""
+
+STRENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4)
+"""Of non-local means: the best one counts."""
 
 
 def spinning(size: int, longest: float) -> Tensor:
@@ -53,3 +65,82 @@ def with_motion(settings: Settings, say: Say) -> list[Row]:
             row["times_dense"] = dense.row["seconds"] / timing.row["seconds"]
             rows.append(row | errors(timing.result, dense.result))
     return rows
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A recipe as all methods see it, and its truth ``(1, 3, H, W)``."""
+
+    seen: dict[str, Tensor]
+    coc: Tensor
+    blur_of: Callable[[str], torchbokeh.LensBlur]
+    noisy: torchbokeh.Samples
+    truth: Tensor
+
+
+def _scene(name: str, settings: Settings) -> _Scene:
+    size = (settings.truth_size, settings.truth_size)
+    scene, camera = RECIPES[name](0, size=size, blur=settings.truth_radius)
+    seen = {key: t[None] for key, t in scene.render(camera).items()}
+    truth = torchbokeh.AccumulationBuffer(views=2 * settings.truth_views)(scene, camera)[:, :3]
+    coc = camera.lens.coc(seen["depth"], size[1])
+    return _Scene(seen, coc, partial(_blur, camera.lens), samples(scene, camera, 1, 0), truth)
+
+
+def _blur(lens: torchbokeh.ThinLens, quality: str) -> torchbokeh.LensBlur:
+    return torchbokeh.LensBlur(lens, quality=quality)
+
+
+def like_lks(settings: Settings, say: Say) -> list[Row]:
+    """Tables 2 and 3 of LKS with recipes of this package: synthesis, and reconstruction from one sample per pixel.
+
+    The truth is the accumulation buffer. ``times_dense`` is the time of the dense scatter of the pinhole picture over
+    that of the method, for synthesis. Nothing without numba.
+    """
+    if not numba_is_there():
+        return []
+    rows: list[Row] = []
+    for name in RECIPES_IN_MOTION:
+        say(f"synthesis and reconstruction with motion: {name}, {settings.truth_size} px")
+        scene = _scene(name, settings)
+        for kind, works in (("synthesis", _synthesis(scene)), ("reconstruction", _reconstruction(scene))):
+            timings = measure(works, settings.repeat, settings.sweep_budget)
+            for method, timing in timings.items():
+                ratio = timings[DENSE].row["seconds"] / timing.row["seconds"] if kind == "synthesis" else None
+                row = {"scene": name, "kind": kind, "method": method, **timing.row, "times_dense": ratio}
+                border = min(int(settings.truth_radius) + 1, (settings.truth_size - 8) // 2)
+                rows.append(row | errors(timing.result[:, :3], scene.truth, border))
+    return rows
+
+
+def _synthesis(scene: _Scene) -> dict[str, Work]:
+    from torchbokeh.report.capsules import dense_capsules, filter_capsules
+
+    seen = scene.seen
+    pinhole = seen["image"], scene.coc, seen["motion"]
+    works: dict[str, Work] = {DENSE: partial(dense_capsules, *pinhole), FILTER: partial(filter_capsules, *pinhole)}
+    for quality in ("exact", "balanced"):
+        blur = scene.blur_of(quality)
+        works[f"LensBlur, image, {quality}"] = partial(blur, seen["image"], seen["depth"], motion=seen["motion"])
+        layered = partial(blur, seen["layers"], seen["layer_depth"], motion=seen["layer_motion"])
+        works[f"LensBlur, layers, {quality}"] = layered
+    return works
+
+
+def _reconstruction(scene: _Scene) -> dict[str, Work]:
+    mean = scene.noisy.colour[:, 0]
+    works: dict[str, Work] = {"one sample per pixel": mean.clone}
+    for layers in (1, 4):
+        works[f"reconstruct, {layers} layers"] = partial(torchbokeh.reconstruct, scene.noisy, layers=layers)
+    works["non-local means"] = partial(_non_local_means, mean, scene.truth)
+    return works
+
+
+def _non_local_means(image: Tensor, truth: Tensor) -> Tensor:
+    """The best that non-local means make of the displayed picture, whatever the strength."""
+    from skimage.restoration import denoise_nl_means
+
+    shown = displayed(image)
+    tried = (denoise_nl_means(shown, patch_size=5, h=h, channel_axis=2) for h in STRENGTHS)
+    linear = [torch.from_numpy(np.clip(t, 0, 1) ** 2.2).permute(2, 0, 1)[None] for t in tried]
+    return max(linear, key=lambda t: float(errors(t, truth, flip=False)["ssim"] or 0))

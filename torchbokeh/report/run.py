@@ -13,7 +13,7 @@ from torchbokeh.report.experiments import (
     one_layer,
 )
 from torchbokeh.report.experiments_blur import against_layers, against_truth, left_out
-from torchbokeh.report.experiments_motion import with_motion
+from torchbokeh.report.experiments_motion import like_lks, with_motion
 from torchbokeh.report.experiments_stages import stages
 from torchbokeh.report.machine import machine
 from torchbokeh.report.measure import flip_is_there
@@ -31,6 +31,7 @@ EXPERIMENTS = {
     "layers": against_layers,
     "threads": against_threads,
     "motion": with_motion,
+    "like_lks": like_lks,
     "left_out": left_out,
     "stages": stages,
 }

@@ -26,6 +26,7 @@ def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
         _layers(rows["layers"], plots),
         _threads(rows["threads"], settings, plots),
         _motion(rows["motion"]),
+        _like_lks(rows["like_lks"], settings),
         _left_out(rows["left_out"], settings),
         _stages(rows["stages"]),
         _methods(found["methods"], found["absent"]),
@@ -279,6 +280,25 @@ def _motion(rows: list[Row]) -> str:
     head = ["radius", "motion", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
     about = f"photo, {size}, turning; up to so many px of radius and motion; errors against the dense scatter."
     return _section("Defocus with motion", about, table(head, cells))
+
+
+def _like_lks(rows: list[Row], settings: Row) -> str:
+    if not rows:
+        return ""
+    head = ["scene", "kind", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
+    cells = [
+        [row["scene"], row["kind"], row["method"], seconds(row["seconds"]), _number(row["times_dense"], ".1f")]
+        + [_number(row[key], form) for key, form in (("ssim", ".4f"), ("psnr", ".1f"), ("l1", ".4f"))]
+        for row in rows
+    ]
+    size = settings["truth_size"]
+    about = (
+        f"Tables 2 and 3 of LKS with recipes of this package, {size} x {size}, radius up to "
+        f"{settings['truth_radius']:g} px: synthesis from the pinhole picture or its layers, and reconstruction from "
+        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. The time of "
+        "non-local means is that of five strengths, of which the best one counts."
+    )
+    return _section("Synthesis and reconstruction", about, table(head, cells))
 
 
 def _left_out(rows: list[Row], settings: Row) -> str:

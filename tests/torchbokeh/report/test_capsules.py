@@ -9,7 +9,7 @@ pytest.importorskip("numba")
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.psfs import Disc
 from torchbokeh.psfs.combined import capsule
-from torchbokeh.report.capsules import dense_capsules
+from torchbokeh.report.capsules import dense_capsules, filter_capsules
 
 
 def picture(n, radius, dx, dy):
@@ -50,3 +50,12 @@ def test_without_motion_it_is_the_dense_scatter_and_a_constant_stays():
     assert float((dense_capsules(image, coc, still) - want).abs().mean()) < 0.01  # the rim is sampled, not integrated
     moving = 20 * torch.rand(1, 2, 40, 50, generator=draw)
     torch.testing.assert_close(dense_capsules(torch.ones_like(image), coc, moving), torch.ones_like(image))
+
+
+def test_the_filter_is_the_scatter_where_all_capsules_are_the_same():
+    image, coc, motion = torch.rand(1, 3, 40, 50), torch.full((1, 1, 40, 50), 4.5), torch.ones(1, 2, 40, 50) * 6
+    got, want = filter_capsules(image, coc, motion), dense_capsules(image, coc, motion)
+    torch.testing.assert_close(got, want, atol=1e-5, rtol=1e-5)
+    uneven = motion * torch.rand(1, 1, 40, 50)
+    torch.testing.assert_close(filter_capsules(torch.ones_like(image), coc, uneven), torch.ones_like(image))
+    assert float((filter_capsules(image, coc, uneven) - dense_capsules(image, coc, uneven)).abs().max()) > 0.01

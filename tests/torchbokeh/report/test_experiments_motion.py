@@ -1,6 +1,6 @@
 import torch
 
-from torchbokeh.report.experiments_motion import DENSE, spinning
+from torchbokeh.report.experiments_motion import DENSE, FILTER, RECIPES_IN_MOTION, spinning
 from torchbokeh.report.methods import QUALITIES
 
 
@@ -19,3 +19,15 @@ def test_every_quality_is_compared_with_the_dense_scatter(report):
     assert rows[DENSE]["times_dense"] == 1
     for name, row in rows.items():
         assert row["ssim"] > 0.8, name
+
+
+def test_synthesis_and_reconstruction_are_those_of_the_paper(report):
+    rows = report["experiments"]["like_lks"]
+    assert {row["scene"] for row in rows} == set(RECIPES_IN_MOTION)
+    found = {(row["scene"], row["method"]): row for row in rows}
+    for name in RECIPES_IN_MOTION:
+        assert found[name, DENSE]["times_dense"] == 1
+        assert found[name, FILTER]["ssim"] > 0.3
+        assert found[name, "LensBlur, layers, exact"]["ssim"] > 0.6
+        assert found[name, "reconstruct, 4 layers"]["ssim"] > found[name, "one sample per pixel"]["ssim"]
+        assert found[name, "non-local means"]["times_dense"] is None

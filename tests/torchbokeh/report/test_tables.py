@@ -27,6 +27,7 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Run time against layers",
         "Run time against threads",
         "Defocus with motion",
+        "Synthesis and reconstruction",
         "What a plan leaves out",
         "What the methods are",
     ]
