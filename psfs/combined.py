@@ -171,8 +171,12 @@ class Combined(PsfModel):
         if labels.motion is None:
             return None
         start, stop = STILL
-        length = labels.motion.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
-        return ((stop - length) / (stop - start)).clamp(0, 1)
+        share = torch.ones_like(labels.motion[:, :1])
+        for way in (labels.motion, labels.offset):  # the discs have no offset
+            if way is not None:
+                length = way.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+                share = share * ((stop - length) / (stop - start)).clamp(0, 1)
+        return share
 
     def places(self, labels: Labels, size: int = 1) -> list[Place]:
         """One PSF, or several in a row where the motion is longer than what is sampled."""

@@ -51,11 +51,13 @@ class Labels(NamedTuple):
         coc: ``(B, 1, H, W)`` signed CoC radius in px.
         depth: ``(B, 1, H, W)`` metres along the optical axis.
         motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter.
+        offset: ``(B, 2, H, W)`` of the centre of the PSF from the pixel, (dx, dy) in px. Models do not look at it.
     """
 
     coc: Tensor | None = None
     depth: Tensor | None = None
     motion: Tensor | None = None
+    offset: Tensor | None = None
 
 
 class Place(NamedTuple):

@@ -7,22 +7,27 @@ from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 
 
-def signed_coc(lens: Lens | None, image: Tensor, depth: object, coc: object) -> Tensor:
-    """The signed CoC of a picture or of layers, from the one of ``depth`` and ``coc`` that is there."""
+def signed_coc(lens: Lens | None, image: Tensor, depth: object, coc: object, margin: int = 0) -> Tensor:
+    """The signed CoC of a picture or of layers, from the one of ``depth`` and ``coc`` that is there.
+
+    ``margin`` px on each side lie beyond the sensor.
+    """
     if (depth is None) == (coc is None):
         raise ValueError("depth: expected either depth or coc, got " + ("both" if coc is not None else "neither"))
     if coc is None:
-        return signed_map(lens, image, "depth", depth, is_coc=False)
+        return signed_map(lens, image, "depth", depth, is_coc=False, margin=margin)
     return signed_map(lens, image, "coc", coc, is_coc=True)
 
 
-def signed_map(lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool) -> Tensor:
+def signed_map(
+    lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool, margin: int = 0
+) -> Tensor:
     """The signed CoC of one map of depth or of CoC, which has the shape of the image but one channel."""
     checked = check_image(name, value, (*image.shape[:-3], 1, *image.shape[-2:]), like=image)
     if not is_coc:
         if lens is None:
             raise ValueError(f"{name}: expected coc, since there is no lens, got depth")
-        return lens.coc(checked, image.shape[-1])
+        return lens.coc(checked, image.shape[-1] - 2 * margin)
     if not torch.compiler.is_compiling() and checked.numel():
         low, high = checked.detach().aminmax()  # several times as fast as `isfinite`; NaN is both
         if not bool((high - low).isfinite()):

@@ -77,29 +77,30 @@ def blur_with_bank(
     return out[:, :-count] / out[:, -count:].clamp_min(TINY).repeat(1, image.shape[1] // count, 1, 1)
 
 
-def packed(labels: Labels, signed: bool = False) -> Tensor:
+def packed(labels: Labels) -> Tensor:
     """The maps of labels but for the CoC, ``(B, E, H, W)``, as channels that may be averaged.
 
     Motion becomes ``(dx dx, dx dy, dy dy)``: a PSF spreads along a line, so that opposite directions are the same.
-    Where they are not, ``signed``, it stays as it is.
     """
     maps = [] if labels.depth is None else [labels.depth.reciprocal()]
-    if labels.motion is not None and signed:
-        maps.append(labels.motion)
-    elif labels.motion is not None:
+    if labels.motion is not None:
         x, y = labels.motion.split(1, 1)
         maps += [x * x, x * y, y * y]
+    if labels.offset is not None:
+        maps.append(labels.offset)
     return torch.cat(maps, 1) if maps else needed(labels)[:, :0]
 
 
-def unpacked(coc: Tensor, maps: Tensor, like: Labels, signed: bool = False) -> Labels:
+def unpacked(coc: Tensor, maps: Tensor, like: Labels) -> Labels:
     """Labels from averages of `packed`: of the same kinds as ``like``."""
-    depth = motion = None
+    depth = motion = offset = None
     if like.depth is not None:
         depth, maps = maps[:, :1].clamp_min(1e-12).reciprocal(), maps[:, 1:]
     if like.motion is not None:
-        motion = maps if signed else _along(*maps.split(1, 1))
-    return Labels(coc, depth, motion)
+        motion, maps = _along(*maps[:, :3].split(1, 1)), maps[:, 3:]
+    if like.offset is not None:
+        offset = maps
+    return Labels(coc, depth, motion, offset)
 
 
 def _along(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
@@ -117,7 +118,6 @@ def splat_bank(
     *,
     highest: int = 0,
     interpolate: bool = False,
-    advance: float = 0.0,
 ) -> Tensor:
     """Blur with the PSFs of a bank.
 
@@ -130,8 +130,6 @@ def splat_bank(
         highest: the coarsest level, see `torchbokeh.ops.merge.highest_level`.
         interpolate: splat the neighbouring samples of the grid as well, by their share, instead of the nearest one
             alone. Without it, gradients to the coordinates of the PSFs run through their size and direction only.
-        advance: by which part of its motion the centre of each PSF lies ahead of the pixel: 0 where the picture shows
-            the middle of the exposure, 0.5 where it shows the beginning.
 
     Returns:
         ``(B, C, H, W)``, not divided by the coverage.
@@ -142,10 +140,10 @@ def splat_bank(
 
     def places(now: Labels, size: int) -> list[Place]:
         found = bank.model.places(now, size)
-        if not advance or now.motion is None:
+        if now.offset is None:
             return found
-        ahead = advance / size * now.motion
-        return [p._replace(offset=ahead if p.offset is None else p.offset + ahead) for p in found]
+        shift = now.offset / size
+        return [p._replace(offset=shift if p.offset is None else p.offset + shift) for p in found]
 
     def splat(cells: Tensor, radius: Tensor | None, now: Labels, size: int) -> Tensor:
         still = bank.model.still(now)
@@ -159,11 +157,10 @@ def splat_bank(
 
     if merging is None or highest == 0:
         return splat(values, labels.coc, labels, 1)
-    signed = advance != 0
-    coc, maps = needed(labels), packed(labels, signed)
+    coc, maps = needed(labels), packed(labels)
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
-        return splat(cells, radius, unpacked(radius * size, means, labels, signed), size)
+        return splat(cells, radius, unpacked(radius * size, means, labels), size)
 
     return merged(values, coc, splat_cells, merging, highest, labels=maps)
 

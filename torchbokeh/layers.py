@@ -6,7 +6,7 @@ circle of confusion), and all are composed front to back, once for every sub-ape
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -40,21 +40,32 @@ CERTAIN = 4.0
 
 
 class Moving(NamedTuple):
-    """How a surface moves while the shutter is open.
+    """How a surface moves while the shutter is open: along a line, or several, one after the other.
 
     Attributes:
-        displacement: ``(B, 2, H, W)``, (dx, dy) in px over the open shutter.
+        parts: for equal parts of the exposure the displacement ``(B, 2, H, W)``, (dx, dy) in px, and where its middle
+            is seen from the pixel, likewise; ``None`` for at the pixel itself.
         bank: the PSFs of defocus with motion, see `torchbokeh.psfs.Combined`.
-        advance: see `torchbokeh.bank_splatting.splat_bank`.
     """
 
-    displacement: Tensor
+    parts: tuple[tuple[Tensor, Tensor | None], ...]
     bank: PsfBank
-    advance: float
 
-    def of_layer(self, number: int) -> "Moving":
-        """The same of one layer, where the displacement is that of several, ``(B, L, 2, H, W)``."""
-        return self._replace(displacement=self.displacement[:, number])
+    @classmethod
+    def along(cls, ways: Sequence[Tensor], bank: PsfBank, *, from_start: bool) -> "Moving":
+        """The motion along displacements, of a picture that shows the start of the exposure, or its middle."""
+        starts = [torch.zeros_like(ways[0])]
+        for way in ways:
+            starts.append(starts[-1] + way)
+        if len(ways) == 1 and not from_start:
+            return cls(((ways[0], None),), bank)
+        half = len(ways) // 2
+        origin = starts[0] if from_start else starts[half] if len(ways) % 2 == 0 else starts[half] + ways[half] / 2
+        return cls(tuple((way, start + way / 2 - origin) for way, start in zip(ways, starts[:-1], strict=True)), bank)
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Moving":
+        """The same with all maps changed."""
+        return self._replace(parts=tuple((change(m), None if o is None else change(o)) for m, o in self.parts))
 
 
 @dataclass(frozen=True)
@@ -79,10 +90,9 @@ class Surface:
         """The surface with its CoC and motion continued to where it is not."""
         if self.alpha is None:
             return self
-        moving = self.moving
-        if moving is not None:
-            moving = moving._replace(displacement=continued(moving.displacement, self.alpha))
-        return replace(self, coc=continued(self.coc, self.alpha), moving=moving)
+        alpha = self.alpha
+        moving = None if self.moving is None else self.moving.mapped(lambda t: continued(t, alpha))
+        return replace(self, coc=continued(self.coc, alpha), moving=moving)
 
 
 def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
@@ -126,9 +136,9 @@ def split_foreground(
     rest_coc = known * coc + (1 - known) * behind_coc
     ahead = behind_it = None
     if moving is not None:
-        filled = pull_push(moving.displacement, torch.maximum(known, 1e-9 * (1 - front)))
-        ahead = moving._replace(displacement=continued(moving.displacement, front))
-        behind_it = moving._replace(displacement=known * moving.displacement + (1 - known) * filled)
+        weight = torch.maximum(known, 1e-9 * (1 - front))
+        ahead = moving.mapped(lambda t: continued(t, front))
+        behind_it = moving.mapped(lambda t: known * t + (1 - known) * pull_push(t, weight))
     front_coc = coc if scale > 1 and moving is None else continued(coc, front)
     return [
         Surface(image * front, front, front_coc, centres[0], ahead),
@@ -215,8 +225,11 @@ def blurred(
         moving = surface.moving
         if moving is None:
             return splat_spans(values, surface.coc, profile, integrate=True)
-        labels = Labels(coc=surface.coc, motion=moving.displacement)
-        return splat_bank(values, labels, moving.bank, merging, highest=highest, advance=moving.advance)
+        share, out = values / len(moving.parts), torch.zeros_like(values)
+        for motion, offset in moving.parts:
+            labels = Labels(coc=surface.coc, motion=motion, offset=offset)
+            out = out + splat_bank(share, labels, moving.bank, merging, highest=highest)
+        return out
 
     source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
     bins = []

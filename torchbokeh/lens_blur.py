@@ -7,8 +7,8 @@ from numbers import Real
 import torch
 from torch import Tensor, nn
 
+from torchbokeh._motion import ADVANCE, Motion, look_at_motion, moving_picture, ways
 from torchbokeh._signed import signed_coc, signed_map
-from torchbokeh.bank_splatting import bank_of_motion
 from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
@@ -30,9 +30,6 @@ from torchbokeh.plan import Hidden, Plan, Seen
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
 from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
-
-ADVANCE = {"centre": 0.0, "start": 0.5}
-"""Moments that a picture may show, and the part of its motion by which the middle of the exposure is ahead."""
 
 Moves = tuple[float, tuple[float, float] | None]
 Background = Tensor | tuple[Tensor, Tensor] | None
@@ -60,6 +57,8 @@ class LensBlur(nn.Module):
             qualities, 3 where all that is hidden is known and 2 where it is guessed; 1 where nothing hides anything.
             With motion, the lens is not cut.
         shutter: which moment of the exposure a picture with motion shows: ``"centre"`` or ``"start"``.
+        margin: px on each side of the input that lie beyond the sensor, and are cut off in the end: light from there is
+            then known at the border. The sensor width of the lens is that of the picture without them.
 
     Raises:
         TypeError: an argument of the wrong kind.
@@ -85,6 +84,7 @@ class LensBlur(nn.Module):
         max_coc: float | None = None,
         subapertures: int | str = "auto",
         shutter: str = "centre",
+        margin: int = 0,
     ) -> None:
         super().__init__()
         if lens is not None and not isinstance(lens, Lens):
@@ -104,12 +104,14 @@ class LensBlur(nn.Module):
         self.max_coc = max_coc
         self.subapertures = _count("subapertures", subapertures)
         self.shutter = shutter
+        self.margin = margin if margin == 0 and not isinstance(margin, bool) else _whole("margin", margin)
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
         return (
             f"layers={self.layers or 'auto'}, quality={self.quality!r}, tolerance={self.tolerance}, "
-            f"max_coc={self.max_coc}, subapertures={self.subapertures or 'auto'}, shutter={self.shutter!r}"
+            f"max_coc={self.max_coc}, subapertures={self.subapertures or 'auto'}, shutter={self.shutter!r}, "
+            f"margin={self.margin}"
         )
 
     def plan(
@@ -118,7 +120,7 @@ class LensBlur(nn.Module):
         depth: Tensor | None = None,
         *,
         coc: Tensor | None = None,
-        motion: Tensor | None = None,
+        motion: Motion = None,
         background: Background = None,
     ) -> Plan:
         """Look at a scene once and say what it needs. Arguments are those of `forward`.
@@ -128,19 +130,11 @@ class LensBlur(nn.Module):
         _, signed, cut = self._inputs(image, depth, coc, background)
         return self._plan(image, signed, cut, self._moves(image, motion), background is not None)
 
-    def _moves(self, image: Tensor, motion: Tensor | None) -> Moves:
-        """Check the motion; return the largest displacement in px, and the one that all pixels share."""
-        if motion is None or motion.numel() == 0:
-            return 0.0, None
-        check_image("motion", motion, (*image.shape[:-3], 2, *image.shape[-2:]), like=image)
-        if not isinstance(self.aperture, Disc):
+    def _moves(self, image: Tensor, motion: Motion) -> Moves:
+        found = look_at_motion(image, motion)
+        if motion is not None and not isinstance(self.aperture, Disc):
             raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
-        components = motion.detach().movedim(-3, 0).flatten(1)
-        ends = torch.stack([*components.aminmax(dim=1), components.norm(dim=0).max().expand(2)])
-        (x, y), (x1, y1), (longest, _) = ends.tolist()
-        if not math.isfinite(longest):
-            raise ValueError(f"motion: expected finite values, got {int((~motion.isfinite()).sum())} that are not")
-        return longest, (x, y) if (x, y) == (x1, y1) else None
+        return found
 
     def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves, background: bool) -> Plan:
         with torch.no_grad():
@@ -222,7 +216,7 @@ class LensBlur(nn.Module):
         depth: Tensor | None = None,
         *,
         coc: Tensor | None = None,
-        motion: Tensor | None = None,
+        motion: Motion = None,
         background: Background = None,
         plan: Plan | None = None,
     ) -> Tensor:
@@ -235,13 +229,14 @@ class LensBlur(nn.Module):
                 disparity for a `DisparityLens`.
             coc: signed CoC radius in px, in the place of ``depth``.
             motion: displacement (dx, dy) in px over the open shutter, ``(B, 2, H, W)`` or ``(B, L, 2, H, W)``: motion
-                blur in the same pass, for which the aperture must be a disc.
+                blur in the same pass, for which the aperture must be a disc. A sequence of such is a curved way: one
+                after the other, each takes an equal part of the exposure.
             background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
                 its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
             plan: a plan made earlier with `plan`; the scene is then not looked at again.
 
         Returns:
-            ``(B, C, H, W)``; for layers ``(B, 4, H, W)``, premultiplied.
+            ``(B, C, H, W)``; for layers ``(B, 4, H, W)``, premultiplied. Smaller by the margin, if there is one.
 
         Raises:
             TypeError: an argument is not a floating-point tensor, or not a `Plan`.
@@ -249,14 +244,14 @@ class LensBlur(nn.Module):
         """
         behind, signed, cut = self._inputs(image, depth, coc, background)
         if image.numel() == 0:
-            return image.clone() if image.dim() == 4 else image.sum(1)
+            return self._cropped(image.clone() if image.dim() == 4 else image.sum(1))
         if plan is None:
             plan = self._plan(image, signed, cut, self._moves(image, motion), background is not None)
         self._check_plan(plan, image, motion, background)
-        moving = self._moving(plan, image, motion)
+        moves = motion if plan.moves else None
         if plan.sharp and not signed.requires_grad:
-            return image.clone()
-        asked = signed.requires_grad or (motion is not None and motion.requires_grad)
+            return self._cropped(image).clone()
+        asked = any(t.requires_grad for t in (signed, *ways(moves)))
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
@@ -268,10 +263,10 @@ class LensBlur(nn.Module):
                     return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
 
                 surfaces = [
-                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving and moving.of_layer(k))
+                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving_picture(image, moves, self.shutter, k))
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
-                if merging is None or moving is not None:
+                if merging is None or moves is not None:
                     surfaces = [s.continued() for s in surfaces]
                 out = (
                     torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
@@ -281,12 +276,18 @@ class LensBlur(nn.Module):
             elif plan.uniform is not None and not asked:
                 out = self._convolved(source, plan, plan.uniform)
             elif len(plan.bins) == 2:
+                moving = moving_picture(image, moves, self.shutter)
                 out = self._over_rest(source, radii, behind, plan, pieces, moving)
-            elif moving is None and len(plan.bins[0]) == 1 and len(pieces) == 1:
+            elif moves is None and len(plan.bins[0]) == 1 and len(pieces) == 1:
                 out = blur_one_layer(source, radii, pieces[0], merging, plan.highest)
             else:
+                moving = moving_picture(image, moves, self.shutter)
                 out, _ = compose([Surface(source, None, radii, plan.bins[0], moving)], pieces, merging, plan.highest)
-        return out.to(image.dtype)
+        return self._cropped(out).to(image.dtype)
+
+    def _cropped(self, out: Tensor) -> Tensor:
+        height, width = out.shape[-2:]
+        return out[..., self.margin : max(height - self.margin, 0), self.margin : max(width - self.margin, 0)]
 
     def _convolved(self, image: Tensor, plan: Plan, radius: float) -> Tensor:
         if not plan.moves or plan.pan is None:
@@ -313,19 +314,15 @@ class LensBlur(nn.Module):
         surfaces = split_foreground(image, radii, behind, plan.bins, COARSE if coarse else 1, moving)
         return compose(surfaces, pieces, merging, plan.highest)[0]
 
-    def _moving(self, plan: Plan, image: Tensor, motion: Tensor | None) -> Moving | None:
-        if motion is None or not plan.moves:
-            return None
-        dtype = compute_dtype(motion, image)
-        return Moving(motion.to(dtype), bank_of_motion(image.device), ADVANCE[self.shutter])
-
     def _inputs(
         self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background
     ) -> tuple[tuple[Tensor, Tensor | None] | None, Tensor, Tensor | None]:
         """Check everything; return the background with its CoC, the signed CoC, and where ``max_coc`` cut it."""
         layered = isinstance(image, Tensor) and image.dim() == 5
         check_image("image", image, ("B", "L", 4, "H", "W") if layered else ("B", "C", "H", "W"))
-        signed = signed_coc(self.lens, image, depth, coc)
+        if image.numel() and 2 * self.margin >= min(image.shape[-2:]):
+            raise ValueError(f"margin: expected less than half of {tuple(image.shape[-2:])}, got {self.margin}")
+        signed = signed_coc(self.lens, image, depth, coc, self.margin)
         limit = self.max_coc
         cut = None if limit is None else signed.abs() > limit
         signed = signed if limit is None else signed.clamp(-limit, limit)
@@ -339,12 +336,13 @@ class LensBlur(nn.Module):
         colour, behind = pair
         check_image("background", colour, tuple(image.shape), like=image)
         if behind is not None:
-            behind = signed_map(self.lens, image, "background[1]", behind, is_coc=coc is not None)
+            is_coc = coc is not None
+            behind = signed_map(self.lens, image, "background[1]", behind, is_coc=is_coc, margin=self.margin)
             behind = behind if limit is None else behind.clamp(-limit, limit)
         return (colour, behind), signed, cut
 
     @staticmethod
-    def _check_plan(plan: Plan, image: Tensor, motion: Tensor | None, background: Background) -> None:
+    def _check_plan(plan: Plan, image: Tensor, motion: Motion, background: Background) -> None:
         if not isinstance(plan, Plan):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
         if plan.size != tuple(image.shape[-2:]):
@@ -360,10 +358,12 @@ class LensBlur(nn.Module):
 
 def _count(name: str, value: int | str) -> int | None:
     """A positive number, or ``None`` for ``"auto"``."""
-    if value == "auto":
-        return None
+    return None if value == "auto" else _whole(name, value, " or 'auto'")
+
+
+def _whole(name: str, value: object, other: str = "") -> int:
     if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected an int or 'auto', got {value!r}")
+        raise TypeError(f"{name}: expected an int{other}, got {value!r}")
     if value < 1:
         raise ValueError(f"{name}: expected at least 1, got {value}")
     return value

@@ -395,3 +395,36 @@ def test_the_same_bits_for_any_number_of_threads(layers: bool) -> None:
         results.append((out, *torch.autograd.grad(out.square().sum(), (source, map_))))
     for one, two in zip(*results, strict=True):
         assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+@pytest.mark.parametrize("layered", [False, True])
+def test_a_margin_is_known_and_cut_off(quality: str, layered: bool) -> None:
+    lens = ThinLens(0.05, 1.4, focus_distance=2.0, sensor_width=0.02)
+    draw = torch.Generator().manual_seed(5)
+    image, depth = torch.rand(1, 3, 72, 88, generator=draw), 1.6 + 3 * torch.rand(1, 1, 9, 11, generator=draw)
+    depth = torch.nn.functional.interpolate(depth, scale_factor=8, mode="bilinear")
+    if layered:
+        image, depth = torch.cat([image, torch.ones(1, 1, 72, 88)], 1)[:, None], depth[:, None]
+    with_margin = LensBlur(lens, quality=quality, margin=12)
+    out = with_margin(image, depth)
+    assert out.shape[-2:] == (48, 64)
+    signed = lens.coc(depth, 64)
+    assert with_margin.plan(image, depth).coc_range == pytest.approx((signed.min().item(), signed.max().item()))
+    torch.testing.assert_close(out, LensBlur(quality=quality)(image, coc=signed)[..., 12:-12, 12:-12])
+    inner = LensBlur(lens, quality=quality)(image[..., 12:-12, 12:-12], depth[..., 12:-12, 12:-12])
+    assert float((out - inner)[..., 12:-12, 12:-12].abs().mean()) < 0.02
+    assert float((out - inner).abs().max()) > 0.02
+
+
+def test_what_a_margin_may_be() -> None:
+    image = torch.rand(1, 3, 10, 12)
+    with pytest.raises(ValueError, match="margin: expected at least 1, got -1"):
+        LensBlur(margin=-1)
+    with pytest.raises(TypeError, match="margin: expected an int, got 1.5"):
+        LensBlur(margin=1.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"margin: expected less than half of \(10, 12\), got 5"):
+        LensBlur(margin=5)(image, coc=torch.zeros(1, 1, 10, 12))
+    sharp = LensBlur(margin=2)(image, coc=torch.zeros(1, 1, 10, 12))
+    assert torch.equal(sharp, image[..., 2:-2, 2:-2])
+    assert "margin=2" in repr(LensBlur(margin=2))

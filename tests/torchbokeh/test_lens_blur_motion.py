@@ -87,6 +87,34 @@ def test_the_shutter_may_open_with_the_picture() -> None:
     assert float((behind - started).abs().max()) > 0.05
 
 
+@pytest.mark.parametrize("shutter", ["centre", "start"])
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_way_in_pieces_is_the_way(shutter: str, count: int) -> None:
+    image, coc = picture(), halves(3, 5)
+    motion = constant(15.0, -6.0) + 0.1 * torch.rand(1, 2, H, W, generator=draw(8))
+    blur = LensBlur(layers=1, shutter=shutter)
+    whole, pieces = (blur(image, coc=coc, motion=m) for m in (motion, [motion / count] * count))
+    assert float((whole - pieces).abs().mean()) < 0.012
+    assert float((whole.mean() - pieces.mean()).abs()) < 1e-3
+
+
+@pytest.mark.parametrize("shutter", ["centre", "start"])
+def test_light_goes_round_a_corner(shutter: str) -> None:
+    dot = torch.zeros(1, 1, H, W)
+    dot[..., H // 2, W // 2] = 1.0
+    coc = halves(0.2, 0.2) + 1e-3 * torch.rand(1, 1, H, W, generator=draw(1))
+    blur = LensBlur(layers=1, shutter=shutter)
+    out = blur(dot, coc=coc, motion=(constant(10.0, 0.0), constant(0.0, 6.0)))[0, 0]
+    # From the left to the corner, and down from there: at the corner the exposure is half over.
+    x0, y0 = (W // 2, H // 2) if shutter == "start" else (W // 2 - 10, H // 2)
+    assert out[y0, x0 + 2 : x0 + 9].min() > 0.3 * out.max()
+    assert out[y0 + 2 : y0 + 5, x0 + 10].min() > 0.3 * out.max()
+    assert float(out[y0 + 4, x0 + 3]) < 0.02 * float(out.max())
+    x, y = (out.sum(0) @ torch.arange(W).float()), (out.sum(1) @ torch.arange(H).float())
+    mean = (x0 + (5 + 10) / 2, y0 + (0 + 3) / 2)
+    assert (x.item() / out.sum().item(), y.item() / out.sum().item()) == pytest.approx(mean, abs=0.3)
+
+
 def test_one_opaque_layer_is_a_plain_picture() -> None:
     image, coc, motion = picture(), halves(2, 6), constant(9.0, 5.0)
     layer = torch.cat([image, torch.ones(1, 1, H, W)], 1)[:, None]
@@ -207,6 +235,10 @@ def test_what_is_refused() -> None:
         LensBlur()(image, coc=coc, motion=endless)
     with pytest.raises(ValueError, match="motion: expected None with an aperture that is not a disc"):
         LensBlur(aperture="6-gon")(image, coc=coc, motion=constant(1.0, 1.0))
+    with pytest.raises(ValueError, match="motion: expected at least one displacement, got an empty sequence"):
+        LensBlur()(image, coc=coc, motion=[])
+    with pytest.raises(TypeError, match="motion: expected a tensor, a sequence of tensors or None, got float"):
+        LensBlur()(image, coc=coc, motion=3.0)  # type: ignore[arg-type]
     plan = LensBlur().plan(image, coc=coc, motion=constant(4.0, 0.0))
     with pytest.raises(ValueError, match="plan: expected the motion it was made with, got none"):
         LensBlur()(image, coc=coc, plan=plan)
