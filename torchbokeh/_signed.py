@@ -19,9 +19,7 @@ def signed_coc(lens: Lens | None, image: Tensor, depth: object, coc: object, mar
     return signed_map(lens, image, "coc", coc, is_coc=True)
 
 
-def signed_map(
-    lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool, margin: int = 0
-) -> Tensor:
+def signed_map(lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool, margin: int = 0) -> Tensor:
     """The signed CoC of one map of depth or of CoC, which has the shape of the image but one channel."""
     checked = check_image(name, value, (*image.shape[:-3], 1, *image.shape[-2:]), like=image)
     if not is_coc:

@@ -1,6 +1,5 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
-import math
 from collections.abc import Sequence
 from numbers import Real
 
@@ -263,7 +262,9 @@ class LensBlur(nn.Module):
                     return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
 
                 surfaces = [
-                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving_picture(image, moves, self.shutter, k))
+                    Surface(
+                        source[:, k, :3], alpha(k), radii[:, k], bins, moving_picture(image, moves, self.shutter, k)
+                    )
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
                 if merging is None or moves is not None:

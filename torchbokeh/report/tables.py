@@ -295,8 +295,8 @@ def _like_lks(rows: list[Row], settings: Row) -> str:
     about = (
         f"Tables 2 and 3 of LKS with recipes of this package, {size} x {size}, radius up to "
         f"{settings['truth_radius']:g} px: synthesis from the pinhole picture or its layers, and reconstruction from "
-        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. The time of "
-        "non-local means is that of five strengths, of which the best one counts."
+        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. The time "
+        "of non-local means is that of five strengths, of which the best one counts."
     )
     return _section("Synthesis and reconstruction", about, table(head, cells))
 
