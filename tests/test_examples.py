@@ -21,6 +21,7 @@ PICTURES = {  # name, size, frames
     "operating_points.py": ("new/a.png", (148, 100), 1),
     "logo_bokeh.py": ("new/a.png", (80, 48), 1),
     "reconstruct.py": ("new/a.png", (192, 32), 1),
+    "motion.py": ("new/a.png", (144, 32), 1),
 }
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 import torchbokeh
 from torchbokeh.cli_dataset import add_dataset
 from torchbokeh.cli_psfs import add_psfs
+from torchbokeh.flow_io import read_flow
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
@@ -102,6 +103,7 @@ def _add_render(render: argparse.ArgumentParser) -> None:
         metavar="SHAPE",
         help="disc, or a polygon such as 6-gon (default disc)",
     )
+    add("--motion", type=Path, metavar="FILE", help="displacement over the open shutter in px: .flo, or .npy (2, H, W)")
     add("--max-coc", type=_positive, metavar="PX", help="limit the blur radius (default: no limit)")
     add("--layers", type=_layers, default="auto", metavar="N", help="depth layers (default auto)")
     grade = render.add_mutually_exclusive_group()
@@ -123,15 +125,16 @@ def _render(args: argparse.Namespace) -> None:
         torch.set_num_threads(args.threads)
     image = read_image(args.image)
     depth = _read_depth(args, image)
+    motion = _read_motion(args, image)
     lens = _lens(args, depth).to(args.device)
     grade = {"quality": args.quality, "tolerance": args.tolerance}
     blur = torchbokeh.LensBlur(lens, aperture=args.aperture, layers=args.layers, max_coc=args.max_coc, **grade)
     image, depth = image.to(args.device), depth.to(args.device)
     with torch.no_grad():
         start = time.perf_counter()
-        plan = blur.plan(image, depth)
+        plan = blur.plan(image, depth, motion=motion)
         print(plan)
-        result = (blur(image, depth, plan=plan) * 2.0**args.exposure).cpu()  # .cpu() waits for the GPU
+        result = (blur(image, depth, motion=motion, plan=plan) * 2.0**args.exposure).cpu()  # .cpu() waits for the GPU
         seconds = time.perf_counter() - start
     write_image(args.output, result)
     print(f"{args.output}: {image.shape[3]} x {image.shape[2]}, {seconds:.2f} s")
@@ -169,6 +172,16 @@ def _read_depth(args: argparse.Namespace, image: Tensor) -> Tensor:
             f"{values[0, 0, y, x]:g}; fill them first"
         )
     return values
+
+
+def _read_motion(args: argparse.Namespace, image: Tensor) -> Tensor | None:
+    if args.motion is None:
+        return None
+    motion = read_flow(args.motion)
+    if motion.shape[2:] != image.shape[2:]:
+        (h, w), (ih, iw) = motion.shape[2:], image.shape[2:]
+        raise ValueError(f"{args.motion}: is {w} x {h}, but {args.image} is {iw} x {ih}; they must be of one size")
+    return motion.to(args.device)
 
 
 def _lens(args: argparse.Namespace, depth: Tensor) -> ThinLens | DisparityLens:
