@@ -10,7 +10,21 @@ from torchbokeh.psfs.combined import capsule, of_radius
 from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel
 
 
-class SimpleLens(PsfModel):
+class RadiusModel(PsfModel):
+    """A model whose one coordinate is the CoC radius beyond half a pixel, in px."""
+
+    def place(self, labels: Labels) -> Place:
+        """The radius of every pixel; needs ``coc``. Larger PSFs are scaled from the largest."""
+        if labels.coc is None:
+            raise ValueError(f"{self.name}: expected coc, got none")
+        return of_radius(self, labels.coc.abs())
+
+    def places(self, labels: Labels, size: int = 1) -> list[Place]:
+        """The PSF in blocks is a smaller one."""
+        return [self.place(labels if labels.coc is None else Labels(coc=labels.coc / size))]
+
+
+class SimpleLens(RadiusModel):
     """The disc of confusion of a thin lens. Its one coordinate is the CoC radius beyond half a pixel, in px.
 
     Renderers splat discs by rows, in closed form and without a bank (`torchbokeh.ops.splat.splat_spans`); this model is
@@ -38,13 +52,3 @@ class SimpleLens(PsfModel):
     def dense(self, coordinates: Sequence[float]) -> NDArray[np.float64]:
         """The light of a disc on every pixel."""
         return capsule(coordinates[0] + MIN_RADIUS, 0.0)
-
-    def place(self, labels: Labels) -> Place:
-        """The radius of every pixel; needs ``coc``."""
-        if labels.coc is None:
-            raise ValueError(f"{self.name}: expected coc, got none")
-        return of_radius(self, labels.coc.abs())
-
-    def places(self, labels: Labels, size: int = 1) -> list[Place]:
-        """The disc in blocks is a smaller disc."""
-        return [self.place(labels if labels.coc is None else Labels(coc=labels.coc / size))]

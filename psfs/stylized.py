@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.psfs.combined import of_radius
-from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel
+from torchbokeh.psfs.model import Axis
+from torchbokeh.psfs.simple_lens import RadiusModel
 from torchbokeh.psfs.tracing import cropped
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def overlaps(count: int, length: float, radius: float) -> Array:
     return np.maximum(high - low, 0.0) * (count / length)
 
 
-class Stylized(PsfModel):
+class Stylized(RadiusModel):
     """A logo, or any other mask, that grows with the defocus.
 
     The coordinate is the CoC radius beyond half a pixel, in px; the radius is half of the mask's longer side. Up to
@@ -148,16 +148,6 @@ class Stylized(PsfModel):
             rows, columns = (overlaps(n, 2 * radius * n / side, radii[0]) for n in channel.shape)
             light.append(rows @ channel @ columns.T)
         return cropped(np.stack(light))
-
-    def place(self, labels: Labels) -> Place:
-        """The radius of every pixel; needs ``coc``."""
-        if labels.coc is None:
-            raise ValueError(f"{self.name}: expected coc, got none")
-        return of_radius(self, labels.coc.abs())
-
-    def places(self, labels: Labels, size: int = 1) -> list[Place]:
-        """The mask in blocks is a smaller mask."""
-        return [self.place(labels if labels.coc is None else Labels(coc=labels.coc / size))]
 
 
 def _checked(mask: Mask) -> Mask:
