@@ -8,13 +8,16 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.integrate import poisson_fft, running_sum_x
-from torchbokeh.ops.merge import Merging, merged
+from torchbokeh.ops.merge import LEAST_CONTRAST, Merging, merged
 from torchbokeh.ops.points import splat_points
+from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels, Place, scaled
 from torchbokeh.psfs.represent import DOMAINS, Domain
 
@@ -23,6 +26,12 @@ _INTEGRALS: dict[Domain, Callable[[Tensor], Tensor]] = {
     "scanline": running_sum_x,
     "laplacian": lambda buffer: poisson_fft(buffer, compact=True),
 }
+
+BRIGHT = 0.5
+"""A pixel is a highlight where its light, spread over its PSF, is this many times the mean of the picture."""
+
+MOST = 4096
+"""Highlights that are drawn densely, at most: the brightest."""
 
 ROOM = 2
 """Pixels around the farthest points: what is shared with a neighbour, and the ring on which the picture vanishes."""
@@ -145,6 +154,8 @@ def splat_bank(
         shift = now.offset / size
         return [p._replace(offset=shift if p.offset is None else p.offset + shift) for p in found]
 
+    dense, values = _highlights(values, labels, bank)
+
     def splat(cells: Tensor, radius: Tensor | None, now: Labels, size: int) -> Tensor:
         still = bank.model.still(now)
         if still is None or radius is None:
@@ -156,13 +167,40 @@ def splat_bank(
         return discs + splat_places(moving, places(now, size), bank, interpolate)
 
     if merging is None or highest == 0:
-        return splat(values, labels.coc, labels, 1)
+        return dense + splat(values, labels.coc, labels, 1)
     coc, maps = needed(labels), packed(labels)
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
         return splat(cells, radius, unpacked(radius * size, means, labels), size)
 
-    return merged(values, coc, splat_cells, merging, highest, labels=maps)
+    return dense + merged(values, coc, splat_cells, merging, highest, labels=maps)
+
+
+def _highlights(values: Tensor, labels: Labels, bank: PsfBank) -> tuple[Tensor | float, Tensor]:
+    """What pixels spread that are so bright that the ripples of a sparse PSF would be seen, and all other values."""
+    if labels.coc is None or labels.motion is None or not values.numel() or not isinstance(bank.model, Combined):
+        return 0.0, values
+    with torch.no_grad():
+        brightness, radius = values.abs(), labels.coc.abs().clamp_min(MIN_RADIUS)
+        length = labels.motion.square().sum(1, keepdim=True).sqrt()
+        alive = (values != 0).any(1, keepdim=True).sum((2, 3), keepdim=True).clamp_min(1)
+        area = radius * (math.pi * radius + 2 * length)
+        bound = brightness.sum((2, 3), keepdim=True) / alive * (BRIGHT * area).clamp_min(LEAST_CONTRAST)
+        excess = (brightness / bound.clamp_min(TINY)).amax(1).flatten()
+        pixels = (excess > 1).nonzero()[:, 0]
+        if len(pixels) > MOST:
+            pixels = excess.topk(MOST).indices.sort().values
+    if not len(pixels):
+        return 0.0, values
+
+    def of(t: Tensor) -> Tensor:
+        return t.movedim(1, -1).flatten(0, 2)[pixels]
+
+    radius, motion = of(labels.coc)[:, 0].abs(), of(labels.motion)
+    centre = torch.zeros_like(motion) if labels.offset is None else of(labels.offset)
+    rest = values.movedim(1, 0).reshape(values.shape[1], -1).index_fill(1, pixels, 0.0)
+    shape = (values.shape[1], values.shape[0], *values.shape[2:])
+    return splat_capsules(values, pixels, radius, motion, centre), rest.reshape(shape).movedim(0, 1)
 
 
 def needed(labels: Labels) -> Tensor:

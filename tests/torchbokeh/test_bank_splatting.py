@@ -144,6 +144,22 @@ def test_with_interpolation_gradients_reach_radius_and_motion(bank: PsfBank) -> 
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("highest", [0, 1])
+def test_a_highlight_has_no_ripples(bank: PsfBank, dtype: torch.dtype, highest: int) -> None:
+    values, labels = torch.ones(1, 2, 90, 100, dtype=dtype), scene(90, 100, 9.3, 20.0, 12.0, dtype)
+    values[0, 0, 45, 50] = 1e6
+    merging = Merging(4.0, 0.015) if highest else None
+    out = splat_bank(values, labels, bank, merging, highest=highest)
+    plain = splat_bank(torch.ones_like(values), labels, bank, merging, highest=highest)
+    lit = out[0, 0] - plain[0, 0]
+    assert float(lit.min()) > -0.6  # what the pixel itself would have spread
+    far = torch.cat([lit[:10].flatten(), lit[-10:].flatten(), lit[:, :10].flatten(), lit[:, -10:].flatten()])
+    assert float(far.abs().max()) < 1e-3
+    assert float(lit.sum()) == pytest.approx(1e6, rel=1e-4)
+    torch.testing.assert_close(out[0, 1], plain[0, 1], atol=2e-2, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_merging_changes_little(bank: PsfBank, dtype: torch.dtype) -> None:
     values, labels = mixed(72, 96, 1.0, 8.0, dtype=dtype)
     x = torch.linspace(4, 24, 96, dtype=dtype).expand(1, 1, 72, 96).contiguous()
