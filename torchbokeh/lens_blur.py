@@ -27,7 +27,7 @@ from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan, Seen
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
-from torchbokeh.psfs.combined import STILL, turned_capsule
+from torchbokeh.psfs.combined import turned_capsule
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
 Moves = tuple[float, tuple[float, float] | None]
@@ -195,8 +195,7 @@ class LensBlur(nn.Module):
         error: float,
     ) -> Plan:
         largest = max(abs(seen.coc_range[0]), abs(seen.coc_range[1]))
-        moves = seen.motion > STILL[0]
-        if moves:
+        if seen.moves:
             pieces = 1
         elif self.subapertures is not None:
             pieces = self.subapertures
@@ -206,8 +205,19 @@ class LensBlur(nn.Module):
             pieces = quality.subapertures[hidden in ("given", "layers")]
         merging = quality.merging
         highest = 0 if merging is None else highest_level(largest, seen.size, merging)
-        sharp = largest <= MIN_RADIUS and hidden != "layers" and not moves
-        return Plan(*seen, sharp, hidden, bins, pieces, repr(self.aperture), quality, highest, error)
+        sharp = largest <= MIN_RADIUS and hidden != "layers" and not seen.moves
+        aperture = repr(self.aperture)
+        return Plan(
+            **vars(seen),
+            sharp=sharp,
+            hidden=hidden,
+            bins=bins,
+            subapertures=pieces,
+            aperture=aperture,
+            quality=quality,
+            highest=highest,
+            predicted_error=error,
+        )
 
     def forward(
         self,

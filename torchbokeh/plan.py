@@ -1,7 +1,7 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from torchbokeh.ops.convolve import CONVOLVE_FROM
 from torchbokeh.psfs.combined import STILL
@@ -15,22 +15,9 @@ _HIDDEN = {
 }
 
 
-class Seen(NamedTuple):
-    """What a look at a scene finds: the first attributes of a `Plan`."""
-
-    size: tuple[int, int]
-    coc_range: tuple[float, float]
-    clamped: float
-    motion: float
-    pan: tuple[float, float] | None
-    layer_count: int
-    layers: tuple[int, ...]
-    opaque: tuple[int, ...]
-
-
 @dataclass(frozen=True)
-class Plan:
-    """What a scene needs, and by that what is left out.
+class Seen:
+    """What a look at a scene finds.
 
     Attributes:
         size: ``(H, W)`` of the image.
@@ -41,14 +28,6 @@ class Plan:
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
         opaque: indices of those that cover everything: their coverage needs no looking at.
-        sharp: every radius is below half a pixel and nothing moves: the image passes through.
-        hidden: how what the foreground hides is known.
-        bins: for every surface, front to back, the centres of its soft bins in px of CoC.
-        subapertures: the lens is cut into the square of this many pieces.
-        aperture: the shape of the aperture, for the reader.
-        quality: the operating point.
-        highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
     """
 
     size: tuple[int, int]
@@ -59,6 +38,28 @@ class Plan:
     layer_count: int
     layers: tuple[int, ...]
     opaque: tuple[int, ...]
+
+    @property
+    def moves(self) -> bool:
+        """Whether motion is to be seen."""
+        return self.motion > STILL[0]
+
+
+@dataclass(frozen=True)
+class Plan(Seen):
+    """What a scene needs, and by that what is left out.
+
+    Attributes, beside those of what was `Seen`:
+        sharp: every radius is below half a pixel and nothing moves: the image passes through.
+        hidden: how what the foreground hides is known.
+        bins: for every surface, front to back, the centres of its soft bins in px of CoC.
+        subapertures: the lens is cut into the square of this many pieces.
+        aperture: the shape of the aperture, for the reader.
+        quality: the operating point.
+        highest: the coarsest level that pixels are merged on; 0 if none are.
+        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
+    """
+
     sharp: bool
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]
@@ -67,11 +68,6 @@ class Plan:
     quality: Quality
     highest: int
     predicted_error: float
-
-    @property
-    def moves(self) -> bool:
-        """Whether motion is to be seen."""
-        return self.motion > STILL[0]
 
     @property
     def uniform(self) -> float | None:
