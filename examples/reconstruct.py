@@ -3,16 +3,14 @@
 import argparse
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import torchbokeh as tb
 from torchbokeh.image_io import write_image
 from torchbokeh.reconstruction import reconstruct
-from torchbokeh.report.measure import displayed, errors
+from torchbokeh.report.experiments_motion import non_local_means
+from torchbokeh.report.measure import errors
 from torchbokeh.scenes import samples
-
-STRENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 
 def ssim(image: torch.Tensor, truth: torch.Tensor) -> float:
@@ -20,16 +18,6 @@ def ssim(image: torch.Tensor, truth: torch.Tensor) -> float:
     found = errors(image, truth, flip=False)["ssim"]
     assert found is not None
     return found
-
-
-def non_local_means(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """The best that non-local means make of the displayed picture, whatever the strength."""
-    from skimage.restoration import denoise_nl_means
-
-    shown = displayed(image)
-    tried = (denoise_nl_means(shown, patch_size=5, h=h, channel_axis=2) for h in STRENGTHS)
-    linear = (torch.from_numpy(np.clip(t, 0, 1) ** 2.2).permute(2, 0, 1)[None] for t in tried)
-    return max(linear, key=lambda t: ssim(t, truth))
 
 
 def main() -> None:

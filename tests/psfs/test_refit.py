@@ -88,7 +88,7 @@ def test_an_elimination_keeps_what_matters() -> None:
 
     count = len(order) // 3
     by_chance = min(l1(draw.permutation(len(order))[:count]) for _ in range(5))
-    assert l1(order[-count:]) < 0.5 * by_chance
+    assert l1(order[-count:]) < 0.35 * by_chance  # 0.31 here
 
 
 def test_the_fewest_that_will_do() -> None:

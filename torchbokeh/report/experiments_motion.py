@@ -132,11 +132,11 @@ def _reconstruction(scene: _Scene) -> dict[str, Work]:
     works: dict[str, Work] = {"one sample per pixel": mean.clone}
     for layers in (1, 4):
         works[f"reconstruct, {layers} layers"] = partial(torchbokeh.reconstruct, scene.noisy, layers=layers)
-    works["non-local means"] = partial(_non_local_means, mean, scene.truth)
+    works["non-local means"] = partial(non_local_means, mean, scene.truth)
     return works
 
 
-def _non_local_means(image: Tensor, truth: Tensor) -> Tensor:
+def non_local_means(image: Tensor, truth: Tensor) -> Tensor:
     """The best that non-local means make of the displayed picture, whatever the strength."""
     from skimage.restoration import denoise_nl_means
 
