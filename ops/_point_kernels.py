@@ -6,6 +6,7 @@ buffer of its own, and the buffers are added in order: the result has the same b
 """
 
 import math
+from collections.abc import Sequence
 
 import numba as nb
 import numpy as np
@@ -195,10 +196,11 @@ def splat_points(
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
+    size: Sequence[int],
 ) -> Tensor:
     """`torchbokeh.ops.points.splat_points` for CPU float32; points are ``(P, 3)``: dx, dy, weight."""
-    b, c, h, w = values.shape
-    rows, columns = h + 2 * pad, w + 2 * pad
+    b, c, h, _ = values.shape
+    rows, columns = (n + 2 * pad for n in size)
     groups = -(-c // 4)
     src = interleave(values).flatten(1).numpy()
     kernel = _splat_whole if _is_whole(points, rotation, position, pad) else _splat_between
@@ -223,12 +225,17 @@ def splat_points(
 
 
 def gather_points(
-    grad: Tensor, index: Tensor, points: Tensor, counts: Tensor, rotation: Tensor | None, position: Tensor | None
+    grad: Tensor,
+    index: Tensor,
+    points: Tensor,
+    counts: Tensor,
+    rotation: Tensor | None,
+    position: Tensor | None,
+    pad: int,
 ) -> Tensor:
     """Adjoint: gradient ``(B, C, Hp, Wp)`` of the buffer to that of the values ``(B, C, H, W)``."""
     b, c = grad.shape[:2]
     h, w = index.shape[-2:]
-    pad = (grad.shape[-1] - w) // 2
     groups = -(-c // 4)
     buffer = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 1, 1, 1, 1)).numpy()
     kernel = _gather_whole if _is_whole(points, rotation, position, pad) else _gather_between

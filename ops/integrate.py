@@ -145,11 +145,18 @@ def poisson_fft(b: Tensor, *, compact: bool) -> Tensor:
     inverse = torch.from_numpy(_torus_spectrum(*size) if compact else _green_spectrum(*size))
     dtype = torch.float32 if b.device.type == "mps" else torch.float64
     inverse = inverse.to(dtype).to(b.device)
-    u = torch.fft.irfft2(torch.fft.rfft2(b.to(dtype), s=size) * inverse, s=size)[..., :height, :width]
-    if compact:
-        edges = torch.cat((u[..., 0], u[..., -1], u[..., 0, :], u[..., -1, :]), dim=-1)
-        u = u - edges.mean(-1)[..., None, None]
-    return u.to(b.dtype)
+    planes = b.reshape(-1, height, width)
+
+    def solved(b: Tensor) -> Tensor:
+        u = torch.fft.irfft2(torch.fft.rfft2(b.to(dtype), s=size) * inverse, s=size)[..., :height, :width]
+        if compact:
+            edges = torch.cat((u[..., 0], u[..., -1], u[..., 0, :], u[..., -1, :]), dim=-1)
+            u = u - edges.mean(-1)[..., None, None]
+        return u.to(b.dtype)
+
+    # On a CPU several planes at once take three times as long as one by one.
+    one_by_one = b.device.type == "cpu" and len(planes) > 0
+    return torch.cat([solved(p) for p in planes.split(1 if one_by_one else len(planes) or 1)]).reshape(b.shape)
 
 
 def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:

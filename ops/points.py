@@ -2,7 +2,7 @@
 Depth-of-field and Motion Blur Synthesis or Reconstruction" (2018), sections 6.1 and 6.2.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -40,6 +40,7 @@ def splat_points(
     pad: int,
     rotation: Tensor | None = None,
     position: Tensor | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Tensor:
     """Splat a PSF from a table for every pixel (LKS section 6.2).
 
@@ -56,16 +57,18 @@ def splat_points(
         rotation: ``(B, 2, 2, H, W)`` matrices that turn (or scale) the offsets of each pixel. Default: none.
         position: ``(B, 2, H, W)`` where the centre of the PSF goes, x and y in px of the unpadded image, 0 being the
             centre of its first pixel. Default: the pixel itself. LKS calls this y'. Must be finite.
+        size: ``(H', W')`` of the picture that is splatted into, where ``values`` are a list of pixels in any shape and
+            ``position`` says where they go. Default: that of ``values``.
 
     Returns:
-        ``(B, C, H + 2 pad, W + 2 pad)`` in the dtype of ``values`` (half precision is computed in float32).
+        ``(B, C, H' + 2 pad, W' + 2 pad)`` in the dtype of ``values`` (half precision is computed in float32).
         Differentiable to ``values``, ``offsets``, ``weights``, ``rotation`` and ``position``; at a whole target the
         derivative to its place is the one towards larger coordinates.
 
     Raises:
         TypeError: an argument has the wrong type or kind of dtype.
-        ValueError: shapes or devices do not fit, ``pad`` is negative, ``counts`` does not run from 0 up to P, or
-            ``index`` points outside the table.
+        ValueError: shapes or devices do not fit, ``pad`` is negative, ``counts`` does not run from 0 up to P,
+            ``index`` points outside the table, or ``size`` comes without ``position``.
 
     Example:
         >>> import torch
@@ -93,6 +96,8 @@ def splat_points(
         raise TypeError(f"pad: expected an int, got {type(pad).__name__}")
     if pad < 0:
         raise ValueError(f"pad: expected 0 or more, got {pad}")
+    if size is not None and position is None:
+        raise ValueError("position: expected one beside size, got None")
     work = working_dtype(values.device)
     out = _splat_points_op(
         values.to(compute_dtype(values)),
@@ -102,6 +107,7 @@ def splat_points(
         None if rotation is None else rotation.to(work),
         None if position is None else position.to(work),
         pad,
+        (h, w) if size is None else size,
     )
     return out.to(values.dtype)
 
@@ -154,27 +160,29 @@ def _targets(
     offsets: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
-    size: tuple[int, int],
+    source: tuple[int, int],
+    size: Sequence[int],
     pad: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """For points at ``offsets`` from their ``pixels``: the upper left of four cells, and the shares right and down.
 
-    ``pixels`` are flat indices into ``(B, H, W)``, as for ``rotation (2, 2, B*H*W)`` and ``position (2, B*H*W)``;
-    cells are flat indices into the padded buffer with its margin.
+    ``pixels`` are flat indices into ``(B, H, W)`` with ``(H, W)`` the shape of the ``source``, as for
+    ``rotation (2, 2, B*H*W)`` and ``position (2, B*H*W)``; cells are flat indices into the padded buffer with
+    its margin.
     """
-    h, w = size
+    (rows, columns), (h, w) = source, size
     target = offsets.T
     if rotation is not None:
         target = (rotation.index_select(2, pixels) * target).sum(1)
     if position is not None:
         target = target + position.index_select(1, pixels)
     else:
-        target = target + torch.stack([pixels % w, pixels // w % h])
+        target = target + torch.stack([pixels % columns, pixels // columns % rows])
     x, y = target + pad
     column = x.floor().clamp(-_MARGIN, w + 2 * pad)
     row = y.floor().clamp(-_MARGIN, h + 2 * pad)
-    rows, stride = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
-    cell = (pixels // (h * w) * rows + row.long() + _MARGIN) * stride + column.long() + _MARGIN
+    padded, stride = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
+    cell = (pixels // (rows * columns) * padded + row.long() + _MARGIN) * stride + column.long() + _MARGIN
     return cell, x - column, y - row
 
 
@@ -186,16 +194,17 @@ def _splat_points_torch(
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
+    size: Sequence[int],
 ) -> Tensor:
     b, c, h, w = values.shape
-    rows, columns = h + 2 * (pad + _MARGIN), w + 2 * (pad + _MARGIN)
+    rows, columns = (n + 2 * (pad + _MARGIN) for n in size)
     work = working_dtype(values.device)
     flat = _flatten(values).to(work)
     turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
     out = torch.zeros(c, b * rows * columns, dtype=work, device=values.device)
     for pixels, numbers in _expand(index, counts, (flat != 0).any(0)):
         here = points.index_select(0, numbers)
-        cell, right, down = _targets(pixels, here[:, :2], turn, place, (h, w), pad)
+        cell, right, down = _targets(pixels, here[:, :2], turn, place, (h, w), size, pad)
         source = flat.index_select(1, pixels) * here[:, 2]
         for step, share in (
             (0, (1 - down) * (1 - right)),
@@ -217,6 +226,8 @@ def _gather_points_torch(
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
+    pad: int,
+    size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
     """Gradients of ``values`` and, if ``geometry``, of ``points``, ``rotation`` and ``position`` as far as given.
@@ -225,8 +236,7 @@ def _gather_points_torch(
     incoming gradient, interpolated bilinearly.
     """
     h, w = values.shape[-2:]
-    pad = (grad.shape[-1] - w) // 2
-    stride = w + 2 * (pad + _MARGIN)
+    stride = size[1] + 2 * (pad + _MARGIN)
     work = working_dtype(values.device)
     g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
     flat = _flatten(values).to(work)
@@ -236,7 +246,7 @@ def _gather_points_torch(
     for pixels, numbers in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
         here = points.index_select(0, numbers)
         offsets, weights = here[:, :2], here[:, 2]
-        cell, right, down = _targets(pixels, offsets, turn, place, (h, w), pad)
+        cell, right, down = _targets(pixels, offsets, turn, place, (h, w), size, pad)
         a, b, c, d = (g.index_select(1, cell + step) for step in (0, 1, stride, stride + 1))
         upper, lower = a + right * (b - a), c + right * (d - c)
         mass = upper + down * (lower - upper)
@@ -270,14 +280,15 @@ def _splat_points_op(
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
+    size: Sequence[int],
 ) -> Tensor:
     """Points are ``(P, 3)``: dx, dy, weight."""
     _check_contents(index, points, counts)
     if has_kernel(values):
         from torchbokeh.ops import _point_kernels
 
-        return _point_kernels.splat_points(values, index, points, counts, rotation, position, pad)
-    return _splat_points_torch(values, index, points, counts, rotation, position, pad)
+        return _point_kernels.splat_points(values, index, points, counts, rotation, position, pad, size)
+    return _splat_points_torch(values, index, points, counts, rotation, position, pad, size)
 
 
 @_splat_points_op.register_fake
@@ -289,9 +300,9 @@ def _(
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
+    size: Sequence[int],
 ) -> Tensor:
-    b, c, h, w = values.shape
-    return values.new_empty(b, c, h + 2 * pad, w + 2 * pad)
+    return values.new_empty(*values.shape[:2], *(n + 2 * pad for n in size))
 
 
 @torch.library.custom_op("torchbokeh::gather_points", mutates_args=())
@@ -303,13 +314,15 @@ def _gather_points_op(
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
+    pad: int,
+    size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
     if has_kernel(values) and not geometry:
         from torchbokeh.ops import _point_kernels
 
-        return [_point_kernels.gather_points(grad, index, points, counts, rotation, position)]
-    return _gather_points_torch(grad, values, index, points, counts, rotation, position, geometry)
+        return [_point_kernels.gather_points(grad, index, points, counts, rotation, position, pad)]
+    return _gather_points_torch(grad, values, index, points, counts, rotation, position, pad, size, geometry)
 
 
 @_gather_points_op.register_fake
@@ -321,6 +334,8 @@ def _(
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
+    pad: int,
+    size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
     inputs = (values, points, rotation, position) if geometry else (values,)
@@ -328,18 +343,19 @@ def _(
 
 
 def _points_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:-1])
+    *tensors, ctx.pad, ctx.size = inputs
+    ctx.save_for_backward(*tensors)
 
 
 def _points_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     _, _, points, _, rotation, position = ctx.saved_tensors
     geometry = any(ctx.needs_input_grad[k] for k in (2, 4, 5))
-    by_values, *rest = _gather_points_op(grad, *ctx.saved_tensors, geometry)
+    by_values, *rest = _gather_points_op(grad, *ctx.saved_tensors, ctx.pad, ctx.size, geometry)
     found = iter(rest)
     by_points, by_rotation, by_position = (
         next(found) if geometry and t is not None else None for t in (points, rotation, position)
     )
-    return by_values, None, by_points, None, by_rotation, by_position, None
+    return by_values, None, by_points, None, by_rotation, by_position, None, None
 
 
 _splat_points_op.register_autograd(_points_backward, setup_context=_points_setup)

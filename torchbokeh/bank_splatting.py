@@ -1,40 +1,29 @@
-"""Splatting from a bank of sparse PSFs: every pixel takes its sample, in the domain in which that is sparse (LKS 6)."""
+"""Splatting from a bank of sparse PSFs: what each pixel needs of it, merged by radius, highlights apart (LKS 6)."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
+from torchbokeh.bank_samples import splat_samples, spreading
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.integrate import poisson_fft, running_sum_x
-from torchbokeh.ops.merge import LEAST_CONTRAST, Merging, merged
-from torchbokeh.ops.points import splat_points
+from torchbokeh.ops.merge import LEAST_CONTRAST, SPREAD, Merging, merged
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
-from torchbokeh.psfs.model import Labels, Place, scaled
-from torchbokeh.psfs.represent import DOMAINS, Domain
-
-_INTEGRALS: dict[Domain, Callable[[Tensor], Tensor]] = {
-    "direct": lambda buffer: buffer,
-    "scanline": running_sum_x,
-    "laplacian": lambda buffer: poisson_fft(buffer, compact=True),
-}
+from torchbokeh.psfs.model import Labels
 
 BRIGHT = 0.5
 """A pixel is a highlight where its light, spread over its PSF, is this many times the mean of the picture."""
 
 MOST = 4096
 """Highlights that are drawn densely, at most: the brightest."""
-
-ROOM = 2
-"""Pixels around the farthest points: what is shared with a neighbour, and the ring on which the picture vanishes."""
 
 
 @lru_cache(maxsize=4)
@@ -121,7 +110,7 @@ def _along(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
 
 def splat_bank(
     values: Tensor,
-    labels: Labels,
+    labels: Labels | Sequence[Labels],
     bank: PsfBank,
     merging: Merging | None = None,
     *,
@@ -133,9 +122,10 @@ def splat_bank(
     Args:
         values: ``(B, C, H, W)``, what each pixel spreads, and last the coverage: ones, in as many channels as the PSFs
             have. For a coloured bank C is a multiple of 3.
-        labels: what the bank's model asks for.
+        labels: what the bank's model asks for. Several labels of the same kinds are PSFs of which each spreads an equal
+            part, as those of a way that bends.
         bank: the PSFs.
-        merging: how far to merge by the radius of ``labels.coc``; ``None``: not at all.
+        merging: how far to merge by the radius of ``labels.coc``, the smallest of them; ``None``: not at all.
         highest: the coarsest level, see `torchbokeh.ops.merge.highest_level`.
         interpolate: splat the neighbouring samples of the grid as well, by their share, instead of the nearest one
             alone. Without it, gradients to the coordinates of the PSFs run through their size and direction only.
@@ -146,45 +136,61 @@ def splat_bank(
     Raises:
         ValueError: the model needs another label.
     """
+    parts = [labels] if isinstance(labels, Labels) else list(labels)
+    dense, values = _highlights(values if len(parts) == 1 else values / len(parts), parts, bank)
 
-    def places(now: Labels, size: int) -> list[Place]:
-        found = bank.model.places(now, size)
-        if now.offset is None:
-            return found
-        shift = now.offset / size
-        return [p._replace(offset=shift if p.offset is None else p.offset + shift) for p in found]
-
-    dense, values = _highlights(values, labels, bank)
-
-    def splat(cells: Tensor, radius: Tensor | None, now: Labels, size: int) -> Tensor:
-        still = bank.model.still(now)
-        if still is None or radius is None:
-            return splat_places(cells, places(now, size), bank, interpolate)
-        discs = splat_spans(cells * still, radius, Disc().profile(), integrate=True)
-        moving = cells * (1 - still)
-        if not bool((still < 1).any()):
-            return discs
-        return discs + splat_places(moving, places(now, size), bank, interpolate)
+    def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
+        out = torch.zeros_like(cells)
+        alive = spreading(cells)[:, None]
+        moving, discs = [], []
+        for part in now:
+            still = None if part.coc is None else bank.model.still(part)
+            if still is None or part.coc is None:
+                moving.append((cells, part))
+                continue
+            if bool((alive & (still < 1)).any()):
+                moving.append((cells * (1 - still), part))
+            if discs and discs[-1][0] is part.coc:
+                discs[-1] = part.coc, discs[-1][1] + still
+            else:
+                discs.append((part.coc, still))
+        for coc, still in discs:
+            if bool((alive & (still > 0)).any()):
+                out = out + splat_spans(cells * still, coc / size, Disc().profile(), integrate=True)
+        return out + splat_samples(moving, bank, size, interpolate) if moving else out
 
     if merging is None or highest == 0:
-        return dense + splat(values, labels.coc, labels, 1)
-    coc, maps = needed(labels), packed(labels)
+        return dense + splat(values, parts, 1)
+    varies = any(part.coc is not parts[0].coc for part in parts)
+    coc = torch.stack([needed(p).abs() for p in parts]).amin(0) if varies else needed(parts[0])
+    maps = [torch.cat([packed(p), needed(p).abs()], 1) if varies else packed(p) for p in parts]
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
-        return splat(cells, radius, unpacked(radius * size, means, labels), size)
+        now, shared = [], radius * size
+        for part, mean in zip(parts, means.split([m.shape[1] for m in maps], 1), strict=True):
+            if not varies:
+                now.append(unpacked(shared, mean, part))
+                continue
+            own = mean[:, -1:]
+            if size > 1:
+                own = (own.square() - SPREAD * size**2).clamp_min((MIN_RADIUS * size) ** 2).sqrt()
+            now.append(unpacked(own, mean[:, :-1], part))
+        return splat(cells, now, size)
 
-    return dense + merged(values, coc, splat_cells, merging, highest, labels=maps)
+    return dense + merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
 
 
-def _highlights(values: Tensor, labels: Labels, bank: PsfBank) -> tuple[Tensor | float, Tensor]:
+def _highlights(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> tuple[Tensor | float, Tensor]:
     """What pixels spread that are so bright that the ripples of a sparse PSF would be seen, and all other values."""
-    if labels.coc is None or labels.motion is None or not values.numel() or not isinstance(bank.model, Combined):
+    maps = [(p.coc, p.motion, p.offset) for p in parts if p.coc is not None and p.motion is not None]
+    if not maps or not values.numel() or not isinstance(bank.model, Combined):
         return 0.0, values
     with torch.no_grad():
-        brightness, radius = values.abs(), labels.coc.abs().clamp_min(MIN_RADIUS)
-        length = labels.motion.square().sum(1, keepdim=True).sqrt()
+        brightness = values.abs()
+        radius = torch.stack([coc.abs().clamp_min(MIN_RADIUS) for coc, _, _ in maps]).mean(0)
+        length = torch.stack([motion.square().sum(1, keepdim=True).sqrt() for _, motion, _ in maps]).sum(0)
         alive = (values != 0).any(1, keepdim=True).sum((2, 3), keepdim=True).clamp_min(1)
-        area = radius * (math.pi * radius + 2 * length)
+        area = radius * (math.pi * radius + 2 * length) / len(maps)
         bound = brightness.sum((2, 3), keepdim=True) / alive * (BRIGHT * area).clamp_min(LEAST_CONTRAST)
         excess = (brightness / bound.clamp_min(TINY)).amax(1).flatten()
         pixels = (excess > 1).nonzero()[:, 0]
@@ -196,11 +202,14 @@ def _highlights(values: Tensor, labels: Labels, bank: PsfBank) -> tuple[Tensor |
     def of(t: Tensor) -> Tensor:
         return t.movedim(1, -1).flatten(0, 2)[pixels]
 
-    radius, motion = of(labels.coc)[:, 0].abs(), of(labels.motion)
-    centre = torch.zeros_like(motion) if labels.offset is None else of(labels.offset)
+    dense = torch.zeros_like(values)
+    for coc, motion, offset in maps:
+        way = of(motion)
+        centre = torch.zeros_like(way) if offset is None else of(offset)
+        dense = dense + splat_capsules(values, pixels, of(coc)[:, 0].abs(), way, centre)
     rest = values.movedim(1, 0).reshape(values.shape[1], -1).index_fill(1, pixels, 0.0)
     shape = (values.shape[1], values.shape[0], *values.shape[2:])
-    return splat_capsules(values, pixels, radius, motion, centre), rest.reshape(shape).movedim(0, 1)
+    return dense, rest.reshape(shape).movedim(0, 1)
 
 
 def needed(labels: Labels) -> Tensor:
@@ -208,70 +217,3 @@ def needed(labels: Labels) -> Tensor:
     if labels.coc is None:
         raise ValueError("labels.coc: expected one, since pixels are merged by it, got none")
     return labels.coc
-
-
-def splat_places(values: Tensor, places: Sequence[Place], bank: PsfBank, interpolate: bool = False) -> Tensor:
-    """Splat ``(B, C, H, W)`` with the PSFs at places, each pixel with all of them. See `splat_bank`."""
-    out = torch.zeros_like(values)
-    for place in places:
-        source = values if place.share is None else values * place.share
-        grid, coordinates = bank.model.grid, place.coordinates.movedim(1, -1)
-        extent = bank.model.extent(coordinates)
-        chosen = grid.neighbours(coordinates) if interpolate else [(grid.index(coordinates), None)]
-        for number, share in chosen:
-            weighed = source if share is None else source * share[:, None].to(source.dtype)
-            drawn = place
-            if extent is not None:
-                ratio = extent / bank.extents.to(extent)[number]
-                drawn = scaled(place, ratio[:, None].to(source.dtype))._replace(offset=place.offset)
-            out = out + _splat_samples(weighed, number[:, None], drawn, bank)
-    return out
-
-
-def _splat_samples(values: Tensor, index: Tensor, place: Place, bank: PsfBank) -> Tensor:
-    """Every pixel spreads one sample ``index (B, 1, H, W)``."""
-    if bank.model.tints:
-        # The last channels are the coverage: how much of the PSF arrives, whatever its colour.
-        count = bank.values.shape[1]
-        gains = bank.gains()[index[:, 0]].movedim(-1, 1).clamp_min(TINY)
-        values = torch.cat([values[:, :-count], values[:, -count:] / gains], 1)
-    out = torch.zeros_like(values)
-    if not bool(values.detach().any()):
-        return out
-    used = index.flatten().bincount(minlength=len(bank)) > 0
-    # Turned by 45 degrees, a point on a corner lies farther away along an axis.
-    stretch = 1.0 if place.frame is None else math.sqrt(2)
-    if place.scale is not None:
-        stretch = stretch * float(place.scale.detach().max())
-    shift = 0.0 if place.offset is None else float(place.offset.detach().abs().max())
-    reach, domains = bank.reach(), bank.domains
-    for number, domain in enumerate(DOMAINS):
-        here = used & (domains == number)
-        if not bool(here.any()):
-            continue
-        pad = math.ceil(float(reach[here].max()) * stretch + shift) + ROOM
-        source = values
-        if domain == "laplacian" and place.scale is not None:
-            source = values / place.scale.square()
-        whole = _INTEGRALS[domain](_splat_channels(source, index, bank, domain, pad, place))
-        out = out + whole[..., pad : pad + values.shape[2], pad : pad + values.shape[3]]
-    return out
-
-
-def _splat_channels(values: Tensor, index: Tensor, bank: PsfBank, domain: Domain, pad: int, place: Place) -> Tensor:
-    position = None
-    if place.offset is not None:
-        rows, columns = values.shape[2:]
-        y, x = torch.meshgrid(
-            torch.arange(rows, device=values.device), torch.arange(columns, device=values.device), indexing="ij"
-        )
-        position = place.offset + torch.stack([x, y])
-    colours = bank.values.shape[1]
-    # Channel k of a coloured PSF spreads the channels k, k + 3, ... of the picture.
-    parts = [
-        splat_points(
-            values[:, k::colours], index, bank.table(domain, k), pad=pad, rotation=place.frame, position=position
-        )
-        for k in range(colours)
-    ]
-    return parts[0] if colours == 1 else torch.stack(parts, 2).flatten(1, 2)

@@ -39,16 +39,29 @@ CERTAIN = 4.0
 """Views of a surface that splats cover to one over this count fully: splats of varying blur thin out, holes do not."""
 
 
-class Moving(NamedTuple):
-    """How a surface moves while the shutter is open: along a line, or several, one after the other.
+class Way(NamedTuple):
+    """A part of a motion, along a line.
 
     Attributes:
-        parts: for equal parts of the exposure the displacement ``(B, 2, H, W)``, (dx, dy) in px, and where its middle
-            is seen from the pixel, likewise; ``None`` for at the pixel itself.
+        motion: displacement ``(B, 2, H, W)``, (dx, dy) in px.
+        offset: where its middle is seen from the pixel, likewise; ``None`` for at the pixel itself.
+        coc: ``(B, 1, H, W)`` radius in px meanwhile; ``None`` for that of the surface.
+    """
+
+    motion: Tensor
+    offset: Tensor | None = None
+    coc: Tensor | None = None
+
+
+class Moving(NamedTuple):
+    """How a surface moves while the shutter is open.
+
+    Attributes:
+        parts: what it does in equal parts of the exposure.
         bank: the PSFs of defocus with motion, see `torchbokeh.psfs.Combined`.
     """
 
-    parts: tuple[tuple[Tensor, Tensor | None], ...]
+    parts: tuple[Way, ...]
     bank: PsfBank
 
     @classmethod
@@ -58,14 +71,29 @@ class Moving(NamedTuple):
         for way in ways:
             starts.append(starts[-1] + way)
         if len(ways) == 1 and not from_start:
-            return cls(((ways[0], None),), bank)
+            return cls((Way(ways[0]),), bank)
         half = len(ways) // 2
         origin = starts[0] if from_start else starts[half] if len(ways) % 2 == 0 else starts[half] + ways[half] / 2
-        return cls(tuple((way, start + way / 2 - origin) for way, start in zip(ways, starts[:-1], strict=True)), bank)
+        middles = [start + way / 2 - origin for way, start in zip(ways, starts[:-1], strict=True)]
+        return cls(tuple(Way(way, middle) for way, middle in zip(ways, middles, strict=True)), bank)
+
+    def approaching(self, ends: Tensor) -> "Moving":
+        """The same while the radius changes, evenly in time, from one end ``(B, 2, H, W)`` to the other, signed."""
+        start, stop = ends.split(1, 1)
+        count = len(self.parts)
+        step = (stop - start) / count
+        # Within a part the mean square of the radius is more than the square of its mean.
+        middles = [start + (k + 0.5) * step for k in range(count)]
+        radii = [(r.square() + step.square() / 12).clamp_min(1e-12).sqrt() for r in middles]
+        return self._replace(parts=tuple(w._replace(coc=r) for w, r in zip(self.parts, radii, strict=True)))
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Moving":
         """The same with all maps changed."""
-        return self._replace(parts=tuple((change(m), None if o is None else change(o)) for m, o in self.parts))
+        return self._replace(parts=tuple(Way(*(None if t is None else change(t) for t in way)) for way in self.parts))
+
+    def labels(self, coc: Tensor) -> list[Labels]:
+        """What the bank wants to know of a surface of that CoC."""
+        return [Labels(coc if w.coc is None else w.coc, motion=w.motion, offset=w.offset) for w in self.parts]
 
 
 @dataclass(frozen=True)
@@ -217,31 +245,45 @@ def blurred(
         if alpha is None:
             return colour, torch.ones_like(coverage), coverage
         half = half_density(*block_sums(surface.coc, alpha), profile, merging, highest)
-        h, w = coverage.shape[2:]
-        whole = upsample(half)[..., 2 * BEYOND : 2 * BEYOND + h, 2 * BEYOND : 2 * BEYOND + w].clamp_min(0)
+        whole = _enlarged_density(half, surface.coc)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
+    moving = surface.moving
+
     def spread(values: Tensor) -> Tensor:
-        moving = surface.moving
         if moving is None:
             return splat_spans(values, surface.coc, profile, integrate=True)
-        share, out = values / len(moving.parts), torch.zeros_like(values)
-        for motion, offset in moving.parts:
-            labels = Labels(coc=surface.coc, motion=motion, offset=offset)
-            out = out + splat_bank(share, labels, moving.bank, merging, highest=highest)
-        return out
+        return splat_bank(values, moving.labels(surface.coc), moving.bank, merging, highest=highest)
 
     source = torch.cat([surface.colour, torch.ones_like(surface.coc) if alpha is None else alpha], 1)
-    bins = []
-    for weight in bin_weights(surface.coc, surface.centres):
-        splat = spread(source * weight)
-        bins.append((splat[:, :-1], splat[:, -1:]))
-    colour, coverage = fill_until_full(bins)
+    splats = [spread(source * weight) for weight in bin_weights(surface.coc, surface.centres)]
+    colour, coverage = fill_until_full([(splat[:, :-1], splat[:, -1:]) for splat in splats])
     if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.
-    whole = spread(torch.ones_like(alpha)).clamp_min(0)
+    if moving is None or merging is None:
+        whole = spread(torch.ones_like(alpha)).clamp_min(0)
+    else:
+        whole = _enlarged_density(_moving_density(surface.coc, moving, merging, highest), surface.coc)
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
+
+
+def _enlarged_density(half: Tensor, like: Tensor) -> Tensor:
+    """The density that `half_density` returns, for all pixels."""
+    h, w = like.shape[2:]
+    return upsample(half)[..., 2 * BEYOND : 2 * BEYOND + h, 2 * BEYOND : 2 * BEYOND + w].clamp_min(0)
+
+
+def _moving_density(coc: Tensor, moving: Moving, merging: Merging, highest: int) -> Tensor:
+    """`half_density` of a surface that moves; its maps are continued to where the surface is not."""
+    full = block_means(torch.ones_like(coc), COARSE)
+
+    def blocks(t: Tensor) -> Tensor:
+        return F.pad(block_means(t, COARSE) / (full * COARSE), (MARGIN,) * 4, mode="replicate")
+
+    inside = F.pad(torch.ones_like(full), (MARGIN,) * 4)
+    labels = moving.mapped(blocks).labels(blocks(coc))
+    return upsample(splat_bank(inside, labels, moving.bank, merging, highest=max(highest - 2, 0)))
 
 
 def block_sums(coc: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchbokeh.bank_splatting import bank_of_motion, splat_places
+from torchbokeh.bank_samples import splat_samples
+from torchbokeh.bank_splatting import bank_of_motion
 from torchbokeh.layers import bin_centres
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
@@ -170,6 +171,4 @@ def _splat_bins(samples: Samples, centres: tuple[float, ...], bank: PsfBank) -> 
 def _splat_about(values: Tensor, one: Samples, bank: PsfBank) -> Tensor:
     """Splat ``(B, C, H, W)`` about the pinhole positions of one sample of each pixel."""
     shift = pinhole_position(one) - _pixels(values)
-    places = bank.model.places(Labels(coc=one.coc, motion=one.motion))
-    moved = [p._replace(offset=shift if p.offset is None else p.offset + shift) for p in places]
-    return splat_places(values, moved, bank)
+    return splat_samples([(values, Labels(coc=one.coc, motion=one.motion, offset=shift))], bank)

@@ -256,10 +256,10 @@ def test_operators_keep_the_rules_of_torch(dtype: torch.dtype, rotated: bool, mo
     rotation, position = (frame[k].double() if k in frame else None for k in ("rotation", "position"))
     args = (index, points, table().counts, rotation, position)
     op = torch.ops.torchbokeh
-    torch.library.opcheck(op.splat_points.default, (values.requires_grad_(), *args, 2))
+    torch.library.opcheck(op.splat_points.default, (values.requires_grad_(), *args, 2, (4, 5)))
     grad = torch.rand(1, 3, 8, 9, dtype=dtype)
     for geometry in (True, False):
-        torch.library.opcheck(op.gather_points.default, (grad, values.detach(), *args, geometry))
+        torch.library.opcheck(op.gather_points.default, (grad, values.detach(), *args, 2, (4, 5), geometry))
 
 
 def test_compiles_to_one_graph_for_any_size() -> None:

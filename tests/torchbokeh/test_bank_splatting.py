@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import torchbokeh.bank_splatting as module
 from torchbokeh import KernelSplatting, Polygon
 from torchbokeh.bank_splatting import packed, splat_bank, unpacked
 from torchbokeh.ops.merge import Merging
@@ -279,7 +278,7 @@ def test_what_is_refused(bank: PsfBank) -> None:
 
 def test_pixels_without_light_and_empty_pictures_cost_nothing(bank: PsfBank, monkeypatch: pytest.MonkeyPatch) -> None:
     labels = scene(12, 14, 30.0, 60.0, 0.0)
-    monkeypatch.setattr(module, "splat_points", None)
+    monkeypatch.setattr("torchbokeh.bank_samples.splat_points", None)
     assert float(splat_bank(torch.zeros(1, 4, 12, 14), labels, bank).abs().max()) == 0
     empty = KernelSplatting(bank=bank)(torch.zeros(0, 3, 4, 5), torch.zeros(0, 1, 4, 5), motion=torch.zeros(0, 2, 4, 5))
     assert empty.shape == (0, 3, 4, 5)
