@@ -24,40 +24,62 @@ def ways(motion: Motion) -> tuple[Tensor, ...]:
     return (motion,) if isinstance(motion, Tensor) else tuple(motion)
 
 
-def look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, float] | None]:
-    """Check the motion; return the longest way in px, and the displacement that all pixels share, if they do.
+def look_at_motion(
+    image: Tensor, motion: Motion, ends: Tensor | None = None
+) -> tuple[float, tuple[float, float] | None, float]:
+    """Check the motion; return the longest way in px, the displacement that all pixels share, if they do, and the
+    largest change of a signed radius in px from one of the ``ends`` to the other.
 
     Raises:
         TypeError: it is no floating-point tensor, and no sequence of such.
         ValueError: a shape, device or value does not fit.
     """
-    if motion is None:
-        return 0.0, None
-    if not isinstance(motion, Tensor | Sequence):
+    if motion is not None and not isinstance(motion, Tensor | Sequence):
         raise TypeError(f"motion: expected a tensor, a sequence of tensors or None, got {type(motion).__name__}")
     found = ways(motion)
-    if not found:
+    if motion is not None and not found:
         raise ValueError("motion: expected at least one displacement, got an empty sequence")
     for way in found:
         check_image("motion", way, (*image.shape[:-3], 2, *image.shape[-2:]), like=image)
-    if image.numel() == 0:
-        return 0.0, None
+    if image.numel() == 0 or (not found and ends is None):
+        return 0.0, None, 0.0
     with torch.no_grad():
-        length = torch.stack([way.square().sum(-3) for way in found]).sqrt().sum(0).max()
-        low, high = found[0].movedim(-3, 0).flatten(1).aminmax(dim=1)
-        longest, *ends = torch.cat([length[None], low, high]).tolist()
+        change = image.new_zeros(1) if ends is None else ends.diff(dim=-3).abs().max()[None]
+        look = [change]
+        if found:
+            length = torch.stack([way.square().sum(-3) for way in found]).sqrt().sum(0).max()
+            look += [length[None], *found[0].movedim(-3, 0).flatten(1).aminmax(dim=1)]
+        change_by, longest, *limits = torch.cat([t.to(change) for t in look]).tolist() + ([] if found else [0.0])
     if not math.isfinite(longest):
         bad = sum(int((~way.isfinite()).sum()) for way in found)
         raise ValueError(f"motion: expected finite values, got {bad} that are not")
-    same = len(found) == 1 and ends[:2] == ends[2:]
-    return longest, (ends[0], ends[1]) if same else None
+    same = len(found) == 1 and limits[:2] == limits[2:]
+    return longest, (limits[0], limits[1]) if same else None, change_by
 
 
-def moving_picture(image: Tensor, motion: Motion, shutter: str, layer: int | None = None) -> Moving | None:
-    """The motion as surfaces have it, of one layer where the maps are those of several; None for none."""
-    found = [way if layer is None else way[:, layer] for way in ways(motion)]
-    if not found:
+def moving_picture(
+    image: Tensor, motion: Motion, ends: Tensor | None, parts: int, shutter: str, layer: int | None = None
+) -> Moving | None:
+    """The motion as surfaces have it, of one layer where the maps are those of several; None for none.
+
+    Args:
+        image: the picture.
+        motion: its motion.
+        ends: signed CoC ``(..., 2, H, W)`` in px when the shutter opens and when it closes.
+        parts: into how many each displacement is cut, where there are ends.
+        shutter: one of `ADVANCE`.
+        layer: which one.
+    """
+    found: Sequence[Tensor] = ways(motion)
+    if not found and ends is None:
         return None
+    if not found and ends is not None:
+        found = [torch.zeros_like(ends)]
     dtype = compute_dtype(image, *found)
-    bank = bank_of_motion(image.device)
-    return Moving.along([way.to(dtype) for way in found], bank, from_start=shutter == "start")
+
+    def of(t: Tensor) -> Tensor:
+        return (t if layer is None else t[:, layer]).to(dtype)
+
+    cut = [of(way) / parts for way in found for _ in range(parts)]
+    moving = Moving.along(cut, bank_of_motion(image.device), from_start=shutter == "start")
+    return moving if ends is None else moving.approaching(of(ends))

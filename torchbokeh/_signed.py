@@ -19,9 +19,11 @@ def signed_coc(lens: Lens | None, image: Tensor, depth: object, coc: object, mar
     return signed_map(lens, image, "coc", coc, is_coc=True)
 
 
-def signed_map(lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool, margin: int = 0) -> Tensor:
-    """The signed CoC of one map of depth or of CoC, which has the shape of the image but one channel."""
-    checked = check_image(name, value, (*image.shape[:-3], 1, *image.shape[-2:]), like=image)
+def signed_map(
+    lens: Lens | None, image: Tensor, name: str, value: object, *, is_coc: bool, margin: int = 0, channels: int = 1
+) -> Tensor:
+    """The signed CoC of one map of depth or of CoC, which has the shape of the image but for its channels."""
+    checked = check_image(name, value, (*image.shape[:-3], channels, *image.shape[-2:]), like=image)
     if not is_coc:
         if lens is None:
             raise ValueError(f"{name}: expected coc, since there is no lens, got depth")

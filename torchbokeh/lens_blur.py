@@ -27,10 +27,10 @@ from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
 from torchbokeh.plan import Hidden, Plan, Seen
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
-from torchbokeh.psfs.combined import turned_capsule
+from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
 
-Moves = tuple[float, tuple[float, float] | None]
+Moves = tuple[float, tuple[float, float] | None, float]
 Background = Tensor | tuple[Tensor, Tensor] | None
 
 
@@ -120,6 +120,7 @@ class LensBlur(nn.Module):
         *,
         coc: Tensor | None = None,
         motion: Motion = None,
+        shutter_depth: Tensor | None = None,
         background: Background = None,
     ) -> Plan:
         """Look at a scene once and say what it needs. Arguments are those of `forward`.
@@ -127,11 +128,20 @@ class LensBlur(nn.Module):
         One small copy from the device, which a forward pass with ``plan=`` saves.
         """
         _, signed, cut = self._inputs(image, depth, coc, background)
-        return self._plan(image, signed, cut, self._moves(image, motion), background is not None)
+        ends = self._ends(image, shutter_depth, is_coc=coc is not None)
+        return self._plan(image, signed, cut, self._moves(image, motion, ends), background is not None)
 
-    def _moves(self, image: Tensor, motion: Motion) -> Moves:
-        found = look_at_motion(image, motion)
-        if motion is not None and not isinstance(self.aperture, Disc):
+    def _ends(self, image: Tensor, shutter_depth: Tensor | None, *, is_coc: bool) -> Tensor | None:
+        """Signed CoC when the shutter opens and when it closes."""
+        if shutter_depth is None:
+            return None
+        given = {"is_coc": is_coc, "margin": self.margin, "channels": 2}
+        ends = signed_map(self.lens, image, "shutter_depth", shutter_depth, **given)
+        return ends if self.max_coc is None else ends.clamp(-self.max_coc, self.max_coc)
+
+    def _moves(self, image: Tensor, motion: Motion, ends: Tensor | None) -> Moves:
+        found = look_at_motion(image, motion, ends)
+        if (motion is not None or ends is not None) and not isinstance(self.aperture, Disc):
             raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
         return found
 
@@ -226,6 +236,7 @@ class LensBlur(nn.Module):
         *,
         coc: Tensor | None = None,
         motion: Motion = None,
+        shutter_depth: Tensor | None = None,
         background: Background = None,
         plan: Plan | None = None,
     ) -> Tensor:
@@ -240,6 +251,9 @@ class LensBlur(nn.Module):
             motion: displacement (dx, dy) in px over the open shutter, ``(B, 2, H, W)`` or ``(B, L, 2, H, W)``: motion
                 blur in the same pass, for which the aperture must be a disc. A sequence of such is a curved way: one
                 after the other, each takes an equal part of the exposure.
+            shutter_depth: depth (CoC where ``coc`` is passed) of what each pixel shows when the shutter opens and when
+                it closes, ``(B, 2, H, W)`` or ``(B, L, 2, H, W)``: what comes nearer is blurred differently on its way.
+                The radius changes evenly in time.
             background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
                 its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
             plan: a plan made earlier with `plan`; the scene is then not looked at again.
@@ -254,10 +268,12 @@ class LensBlur(nn.Module):
         behind, signed, cut = self._inputs(image, depth, coc, background)
         if image.numel() == 0:
             return self._cropped(image.clone() if image.dim() == 4 else image.sum(1))
+        ends = self._ends(image, shutter_depth, is_coc=coc is not None)
         if plan is None:
-            plan = self._plan(image, signed, cut, self._moves(image, motion), background is not None)
-        self._check_plan(plan, image, motion, background)
+            plan = self._plan(image, signed, cut, self._moves(image, motion, ends), background is not None)
+        self._check_plan(plan, image, (motion, ends), background)
         moves = motion if plan.moves else None
+        ends = ends if plan.approaches else None
         if plan.sharp and not signed.requires_grad:
             return self._cropped(image).clone()
         asked = any(t.requires_grad for t in (signed, *ways(moves)))
@@ -266,18 +282,21 @@ class LensBlur(nn.Module):
             pieces = subdivide(self.aperture.profile(), plan.subapertures)
             merging = plan.quality.merging
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
+            still = moves is None and ends is None
+
+            def moving(layer: int | None = None) -> Moving | None:
+                return moving_picture(image, moves, ends, plan.parts, self.shutter, layer)
+
             if image.dim() == 5:
 
                 def alpha(k: int) -> Tensor | None:
                     return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
 
                 surfaces = [
-                    Surface(
-                        source[:, k, :3], alpha(k), radii[:, k], bins, moving_picture(image, moves, self.shutter, k)
-                    )
+                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving(k))
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
-                if merging is None or moves is not None:
+                if merging is None or not still:
                     surfaces = [s.continued() for s in surfaces]
                 out = (
                     torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
@@ -287,13 +306,11 @@ class LensBlur(nn.Module):
             elif plan.uniform is not None and not asked:
                 out = self._convolved(source, plan, plan.uniform)
             elif len(plan.bins) == 2:
-                moving = moving_picture(image, moves, self.shutter)
-                out = self._over_rest(source, radii, behind, plan, pieces, moving)
-            elif moves is None and len(plan.bins[0]) == 1 and len(pieces) == 1:
+                out = self._over_rest(source, radii, behind, plan, pieces, moving())
+            elif still and len(plan.bins[0]) == 1 and len(pieces) == 1:
                 out = blur_one_layer(source, radii, pieces[0], merging, plan.highest)
             else:
-                moving = moving_picture(image, moves, self.shutter)
-                out, _ = compose([Surface(source, None, radii, plan.bins[0], moving)], pieces, merging, plan.highest)
+                out, _ = compose([Surface(source, None, radii, plan.bins[0], moving())], pieces, merging, plan.highest)
         return self._cropped(out).to(image.dtype)
 
     def _cropped(self, out: Tensor) -> Tensor:
@@ -353,13 +370,16 @@ class LensBlur(nn.Module):
         return (colour, behind), signed, cut
 
     @staticmethod
-    def _check_plan(plan: Plan, image: Tensor, motion: Motion, background: Background) -> None:
+    def _check_plan(plan: Plan, image: Tensor, moves: tuple[Motion, Tensor | None], background: Background) -> None:
         if not isinstance(plan, Plan):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
         if plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
-        if plan.moves and motion is None:
-            raise ValueError("plan: expected the motion it was made with, got none")
+        for name, value, asked in zip(
+            ("motion", "shutter_depth"), moves, (plan.motion > STILL[0], plan.approaches), strict=True
+        ):
+            if asked and value is None:
+                raise ValueError(f"plan: expected the {name} it was made with, got none")
         count = image.shape[1] if image.dim() == 5 else 0
         if plan.layer_count != count:
             raise ValueError(f"plan: expected one for {count} layers, got one for {plan.layer_count}")

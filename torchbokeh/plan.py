@@ -1,5 +1,6 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,6 +9,12 @@ from torchbokeh.psfs.combined import STILL
 from torchbokeh.quality import Quality
 
 Hidden = Literal["nothing", "filled", "given", "layers"]
+
+STEP = 2.0
+"""Change of a radius in px over one part of the exposure."""
+
+MOST_PARTS = 12
+"""Parts of the exposure, at most: of larger radii a larger step is not seen."""
 
 _HIDDEN = {
     "filled": "what it hides is filled from its surroundings (pass background= if you know it)",
@@ -25,6 +32,7 @@ class Seen:
         clamped: share of the pixels whose radius ``max_coc`` cut.
         motion: longest displacement in px over the open shutter.
         pan: the displacement (dx, dy) that all pixels share; None where they do not.
+        approach: largest change of a signed radius in px while the shutter is open.
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
         opaque: indices of those that cover everything: their coverage needs no looking at.
@@ -35,6 +43,7 @@ class Seen:
     clamped: float
     motion: float
     pan: tuple[float, float] | None
+    approach: float
     layer_count: int
     layers: tuple[int, ...]
     opaque: tuple[int, ...]
@@ -42,7 +51,17 @@ class Seen:
     @property
     def moves(self) -> bool:
         """Whether motion is to be seen."""
-        return self.motion > STILL[0]
+        return self.motion > STILL[0] or self.approaches
+
+    @property
+    def approaches(self) -> bool:
+        """Whether motion toward the camera, or away, is to be seen."""
+        return self.approach > STILL[0]
+
+    @property
+    def parts(self) -> int:
+        """Into how many parts of constant radius the exposure is cut."""
+        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
 
 
 @dataclass(frozen=True)
@@ -76,7 +95,7 @@ class Plan(Seen):
         if low != high or self.hidden != "nothing":
             return None
         if self.moves:
-            return low if self.pan is not None else None
+            return low if self.pan is not None and not self.approaches else None
         return low if self.highest == 0 and abs(low) >= CONVOLVE_FROM else None
 
     def __str__(self) -> str:
@@ -100,6 +119,8 @@ class Plan(Seen):
             lines.append(f"One surface in {counts} bin{'s' if len(self.bins[0]) > 1 else ''}: no foreground is needed.")
         if self.moves:
             lines.append(f"Motion up to {self.motion:.1f} px, in one splat with the defocus, through the whole lens.")
+            if self.approaches:
+                lines.append(f"Motion in depth changes radii by up to {self.approach:.1f} px, in {self.parts} steps.")
         elif self.subapertures > 1:
             lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
         else:

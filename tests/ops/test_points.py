@@ -380,3 +380,26 @@ def test_without_numba_the_torch_path_takes_over_and_says_so_once(monkeypatch: p
 
 def test_examples() -> None:
     assert doctest.testmod(torchbokeh.ops.points).failed == 0
+
+
+@pytest.mark.parametrize("dtype", [F32, F64])
+@pytest.mark.parametrize("rotated", [False, True])
+def test_a_list_of_pixels_is_the_picture_that_they_are_of(dtype: torch.dtype, rotated: bool) -> None:
+    values, index, frame = scene(2, 3, 5, 6, dtype, rotated)
+    points = table(whole=False, dtype=dtype)
+    aim = torch.rand(2, 3, 9, 10, dtype=dtype)
+
+    def listed(t: Tensor) -> Tensor:
+        return t.flatten(-2).flip(-1).unflatten(-1, (10, 3))
+
+    place = torch.stack(torch.meshgrid(torch.arange(6), torch.arange(5), indexing="xy")).to(dtype).expand(2, -1, -1, -1)
+    grads = []
+    for change in (lambda t: t, listed):
+        given = change(values).clone().requires_grad_()
+        turn = {name: change(t) for name, t in frame.items()}
+        out = splat_points(given, change(index), points, pad=2, position=change(place), size=(5, 6), **turn)
+        assert_close(out, splat_points(values, index, points, pad=2, **frame), 1e-6)
+        grads.append(torch.autograd.grad((aim * out).sum(), given)[0])
+    assert_close(grads[1], listed(grads[0]), 1e-6)
+    with pytest.raises(ValueError, match="position: expected one beside size, got None"):
+        splat_points(values, index, points, pad=2, size=(5, 6))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 import torchbokeh as tb
 from torchbokeh import LensBlur
+from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.report.measure import errors
 
 H, W = 40, 56
@@ -244,3 +245,102 @@ def test_what_is_refused() -> None:
         LensBlur()(image, coc=coc, plan=plan)
     still = dataclasses.replace(plan, motion=0.0)
     assert torch.equal(LensBlur()(image, coc=coc, motion=constant(9.0, 0.0), plan=still), LensBlur()(image, coc=coc))
+
+
+def ends(start: float, stop: float) -> Tensor:
+    return constant(start, stop)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "motion", "bound"),
+    [
+        (2.0, 10.0, (20.0, 0.0), 0.16),
+        (2.0, 10.0, (12.0, 9.0), 0.16),
+        (-4.0, 5.0, (8.0, -6.0), 0.25),
+        (4.0, 10.0, (0.0, 0.0), 0.12),
+    ],
+)
+def test_a_dot_that_comes_nearer_is_all_its_discs(
+    start: float, stop: float, motion: tuple[float, float], bound: float
+) -> None:
+    image = torch.zeros(1, 3, H, W)
+    image[..., H // 2, W // 2] = 1.0
+    blur, moments = LensBlur(layers=1, subapertures=1), (torch.arange(64) + 0.5) / 64
+    way = constant(*motion)
+    coc = halves((start + stop) / 2, (start + stop) / 2)
+    got = blur(image, coc=coc, motion=way, shutter_depth=ends(start, stop))
+    values, pixel = image.double(), torch.tensor([H // 2 * W + W // 2])
+    want = sum(
+        splat_capsules(
+            values,
+            pixel,
+            torch.tensor([abs(start + (stop - start) * t)]),
+            torch.zeros(1, 2, dtype=torch.float64),
+            (t - 0.5) * torch.tensor([motion], dtype=torch.float64),
+        )
+        for t in moments.double().tolist()
+    )
+    assert float((got - want / 64).abs().sum() / 3) < bound
+    plain = blur(image, coc=coc, motion=way)
+    assert float((plain - want / 64).abs().sum() / 3) > 2 * bound
+    # Back and forth is the same with a centred shutter.
+    back = blur(image, coc=coc, motion=-way, shutter_depth=ends(stop, start))
+    torch.testing.assert_close(back, got, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_nothing_changes_where_depth_does_not(quality: str) -> None:
+    blur, way = LensBlur(quality=quality), constant(6.0, 2.0)
+    given = {"coc": halves(9, 3), "motion": way}
+    both = torch.cat([halves(9, 3), halves(9.2, 3)], 1)
+    assert torch.equal(blur(picture(), **given, shutter_depth=both), blur(picture(), **given))
+    flat = torch.full((1, 3, H, W), 0.6)
+    for motion in (way, [way, -way], None):
+        out = blur(flat, coc=halves(9, 3), motion=motion, shutter_depth=torch.cat([halves(14, -2), halves(4, 6)], 1))
+        torch.testing.assert_close(out, flat, atol=2e-5, rtol=0)
+
+
+def test_depth_at_the_ends_goes_through_the_lens() -> None:
+    lens = tb.ThinLens(0.05, 0.5, 2.0, 0.036)
+    depth = constant(2.2)
+    both = constant(2.4, 2.0)
+    got = LensBlur(lens)(picture(), depth, shutter_depth=both)
+    want = LensBlur()(picture(), coc=lens.coc(depth, W), shutter_depth=lens.coc(both, W))
+    torch.testing.assert_close(got, want)
+    layers = torch.cat([picture(), torch.ones(1, 1, H, W)], 1)[:, None]
+    layered = LensBlur(lens)(layers, depth[:, None], shutter_depth=both[:, None])
+    torch.testing.assert_close(layered[:, :3], got, atol=1e-5, rtol=0)
+    cut = LensBlur(lens, max_coc=1.0)
+    assert cut.plan(picture(), depth, shutter_depth=both).approach <= 2
+
+
+def test_gradients_reach_the_depth_at_the_ends() -> None:
+    blur, image, coc = LensBlur(layers=1, subapertures=1), picture().double(), halves(4, 4).double()
+    aim = torch.rand(1, 3, H, W, generator=draw(5)).double()
+    both = (ends(3.0, 7.0).double() + 0.1 * torch.rand(1, 2, H, W, generator=draw(4))).requires_grad_()
+    plan = blur.plan(image, coc=coc, shutter_depth=both)
+
+    def loss(given: Tensor) -> Tensor:
+        return (aim * blur(image, coc=coc, shutter_depth=given, plan=plan)).sum()
+
+    (slope,) = torch.autograd.grad(loss(both), both)
+    step = 1e-5 * torch.rand(1, 2, H, W, generator=draw(6)).double()
+    with torch.no_grad():
+        change = (loss(both + step) - loss(both - step)) / 2
+    torch.testing.assert_close((slope * step).sum(), change, rtol=1e-3, atol=0)
+
+
+def test_the_plan_says_that_radii_change() -> None:
+    blur = LensBlur()
+    plan = blur.plan(picture(), coc=halves(4, 4), shutter_depth=ends(2.0, 9.0))
+    assert plan.approaches
+    assert plan.parts == 4
+    assert plan.uniform is None
+    assert "Motion in depth changes radii by up to 7.0 px, in 4 steps" in str(plan)
+    with pytest.raises(ValueError, match="plan: expected the shutter_depth it was made with, got none"):
+        blur(picture(), coc=halves(4, 4), plan=plan)
+    for wrong, message in ((halves(1, 1), r"shutter_depth: expected shape"), (ends(1.0, math.nan), "finite")):
+        with pytest.raises(ValueError, match=message):
+            blur(picture(), coc=halves(4, 4), shutter_depth=wrong)
+    with pytest.raises(ValueError, match="not a disc"):
+        LensBlur(aperture="6-gon")(picture(), coc=halves(4, 4), shutter_depth=ends(2.0, 9.0))

@@ -124,7 +124,8 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             target = buffer(scene, camera)[0, :3]
         for key, empty in (("layers", 0.0), ("layer_depth", torch.inf), ("layer_motion", 0.0)):
             seen[key] = _filled(seen[key], self.layers, empty)
-        del seen["alpha"]
+        for key in ("alpha", "shutter_depth", "layer_shutter_depth"):
+            del seen[key]
         lens = {key: value.clone() for key, value in camera.lens._values().items()}
         coc = camera.lens.coc(seen["depth"], self.resolution[1])
         return {**seen, "coc": coc, "target": target, "lens": lens, "recipe": name, "index": index}

@@ -110,8 +110,10 @@ class Scene:
         Returns:
             ``image (3, H, W)`` premultiplied by ``alpha (1, H, W)``; ``depth (1, H, W)`` in metres, ``inf`` for the
             sky and where nothing is; ``motion (2, H, W)``, the way (dx, dy) in px from the opening to the closing of
-            the shutter; and front to back, hidden surfaces included, ``layers (L, 4, H, W)`` of premultiplied RGBA,
-            ``layer_depth (L, 1, H, W)`` and ``layer_motion (L, 2, H, W)``. All float32.
+            the shutter; ``shutter_depth (2, H, W)``, the depth of what the pixel shows at these two moments; and front
+            to back, hidden surfaces included, ``layers (L, 4, H, W)`` of premultiplied RGBA,
+            ``layer_depth (L, 1, H, W)``, ``layer_motion (L, 2, H, W)`` and ``layer_shutter_depth (L, 2, H, W)``. All
+            float32.
 
         Raises:
             TypeError: ``camera`` is no `Camera`, or a number is no int.
@@ -145,8 +147,8 @@ class Scene:
             level = torch.full((len(grid), 1), lod)
             rgba, _ = render_planes(one, inverse3(several)[:, None], level, (bottom - top, right - left))
             if bool((rgba[0, 3] > 0).any()):
-                depth, motion = _geometry(three, rgba, one)
-                found.append(Fragments(top, left, rgba[0], depth, motion))
+                depth, way = _geometry(three, rgba, one)
+                found.append(Fragments(top, left, rgba[0], depth, way))
         return found
 
 
@@ -181,10 +183,10 @@ def _corners(height: float, width: float, rim: float = 0.0) -> Tensor:
 
 
 def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Tensor]:
-    """Depth and motion of a card at the centres of the pixels, from its homographies half way, before and after."""
+    """Depth and way of a card at the centres of the pixels, from its homographies half way, before and after."""
     h, w = rgba.shape[2:]
     if plate.infinite[0]:
-        return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(2, h, w)
+        return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(4, h, w)
     middle, opening, closing = matrices
     x, y = pixel_centres((h, w), middle)
     s, t, inverse_depth = torch.einsum("ij,jyx->iyx", inverse3(middle), torch.stack([x, y, torch.ones_like(x)]))
@@ -194,11 +196,12 @@ def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Te
     inverse_depth = inverse_depth.clamp(1 / far if far > 0 else 1e-9, 1 / near if near > 0 else torch.inf)
     depth = inverse_depth.reciprocal()[None]
     if torch.equal(opening, closing):
-        return depth.to(rgba), rgba.new_zeros(2, h, w)
+        return depth.to(rgba), rgba.new_zeros(4, h, w)
     texel = torch.stack([s / inverse_depth, t / inverse_depth, torch.ones_like(s)])
     start, stop = (torch.einsum("ij,jyx->iyx", m, texel) for m in (opening, closing))
-    motion = stop[:2] / stop[2:].clamp_min(1e-6) - start[:2] / start[2:].clamp_min(1e-6)
-    return depth.to(rgba), motion.to(rgba)
+    ends = torch.stack([start, stop])
+    places, nearness = ends[:, :2] / ends[:, 2:].clamp_min(1e-6), ends[:, 2].clamp_min(1e-6).reciprocal()
+    return depth.to(rgba), torch.cat([places[1] - places[0], nearness - inverse_depth]).to(rgba)
 
 
 def _minified(homography: Tensor, plate: Plates, samples: int) -> int:

@@ -52,17 +52,19 @@ def over(layers: Tensor) -> Tensor:
 def check(seen: dict[str, Tensor], size: tuple[int, int]) -> None:
     """What holds for every picture."""
     count = len(seen["layers"])
-    shapes = {"image": (3,), "alpha": (1,), "depth": (1,), "motion": (2,)}
+    shapes = {"image": (3,), "alpha": (1,), "depth": (1,), "motion": (2,), "shutter_depth": (2,)}
     shapes |= {"layers": (count, 4), "layer_depth": (count, 1), "layer_motion": (count, 2)}
+    shapes |= {"layer_shutter_depth": (count, 2)}
     assert {name: tuple(t.shape) for name, t in seen.items()} == {name: (*s, *size) for name, s in shapes.items()}
     assert all(t.dtype == torch.float32 and not t.isnan().any() for t in seen.values())
     assert all(bool(seen[k].isfinite().all()) for k in ("image", "alpha", "motion", "layers", "layer_motion"))
-    assert bool((seen["depth"] > 0).all() and (seen["layer_depth"] > 0).all())
+    assert all(bool((t > 0).all()) for name, t in seen.items() if "depth" in name)
     picture = torch.cat([seen["image"], seen["alpha"]]).double()
     torch.testing.assert_close(picture, over(seen["layers"]), rtol=1e-5, atol=1e-5)
     empty = seen["layers"][:, 3:] == 0
     assert bool((seen["layers"] * empty == 0).all() and (seen["layer_motion"] * empty == 0).all())
     assert bool(seen["layer_depth"][empty].isposinf().all())
+    assert bool(seen["layer_shutter_depth"][empty.expand_as(seen["layer_shutter_depth"])].isposinf().all())
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -116,6 +118,16 @@ def test_many_cards_are_what_the_tracer_sees_but_in_shared_pixels() -> None:
     errors = np.concatenate(errors)
     assert (errors > 0.02).mean() < 0.05
     assert errors.mean() < 0.005
+
+
+def test_depth_at_both_ends_of_the_exposure() -> None:
+    coming = Sprite(flat(*RED), position=(0.0, 0.0, 2.0), size=(0.5, 0.4), velocity=(0.3, 0.0, -20.0))
+    look = camera(shutter=0.02)
+    seen = Scene((coming,), WALL).render(look)
+    there = seen["layers"][0, 3] == 1
+    torch.testing.assert_close(seen["layer_shutter_depth"][0][:, there].mean(1), torch.tensor([2.2, 1.8]))
+    torch.testing.assert_close(seen["shutter_depth"][:, there].mean(1), torch.tensor([2.2, 1.8]))
+    torch.testing.assert_close(seen["shutter_depth"][:, 0, 0], torch.tensor([6.0, 6.0]))
 
 
 def test_hidden_surfaces_are_there() -> None:
