@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchbokeh.ops.sellmeier import refractive_index
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, scaled, turned
 from torchbokeh.psfs.tracing import cropped, splat_rays, spread
 
@@ -32,21 +33,6 @@ PSFs of two seeds differ by 0.1 % (relative L1) or less, and if they are pre-fil
 
 NODES = 8
 """Coordinates along each axis that a pre-filtered PSF is traced at, with an equal share of the rays for each pair."""
-
-
-def refractive_index(wavelength: float) -> float:
-    """Of the glass BK7, by Sellmeier's equation; the wavelength in micrometres, 0.31 to 2.3.
-
-    Source:
-        Schott's data sheet of N-BK7.
-
-    Example:
-        >>> round(refractive_index(0.5876), 5)
-        1.5168
-    """
-    terms = ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653))
-    square = wavelength**2
-    return math.sqrt(1 + sum(b * square / (square - c) for b, c in terms))
 
 
 @dataclass(frozen=True)
@@ -77,7 +63,7 @@ class Singlet:
 
 def singlet(focal_length: float, f_number: float, focus_distance: float) -> Singlet:
     """The lens with these data for green light: the lensmaker's equation and its paraxial matrix."""
-    n = refractive_index(WAVELENGTHS[1])
+    n = refractive_index("BK7", 1000 * WAVELENGTHS[1])
     thickness = THICKNESS * focal_length
     radius = focal_length * (n - 1) * THICKNESS / (n * (1 - math.sqrt(1 - THICKNESS / n)))
     power = (n - 1) / radius
@@ -264,7 +250,7 @@ class PhysicalLens(PsfModel):
         start = np.sqrt(points[0]) * np.stack([np.cos(math.pi * points[1]), np.sin(math.pi * points[1])])
         nearness = self.lens.nearness * (1 - self._sign * coc / self.axes[0].bound)
         slope = eccentricity * self._corner
-        indices = [refractive_index(wavelength) for wavelength in WAVELENGTHS]
+        indices = [refractive_index("BK7", 1000 * wavelength) for wavelength in WAVELENGTHS]
         centre = trace(self.lens, np.zeros((2, 1)), nearness, slope, indices[1]).x
         for channel, index in zip(picture, indices, strict=True):
             ray = trace(self.lens, start, nearness, slope, index)
