@@ -135,7 +135,7 @@ def _checked(samples: Samples) -> Samples:
         bad = int((~maps[name].isfinite()).sum())
         if bad:
             raise ValueError(f"samples.{name}: expected finite numbers where a sample is present, got {bad} others")
-    off = float(((maps["position"].detach() - _pixels(maps["position"])) * present).abs().max())
+    off = float(((maps["position"].detach() - pixel_positions(maps["position"])) * present).abs().max())
     if off > 0.5 + SLACK:
         raise ValueError(
             f"samples.position: expected points within their own pixels, got one {off:g} px from its centre"
@@ -143,7 +143,7 @@ def _checked(samples: Samples) -> Samples:
     return samples._replace(**maps)
 
 
-def _pixels(like: Tensor) -> Tensor:
+def pixel_positions(like: Tensor) -> Tensor:
     """Centres of all pixels ``(2, H, W)``, x and y in px, 0 being that of the first."""
     return torch.stack(pixel_centres((like.shape[-2], like.shape[-1]), like)) - 0.5
 
@@ -170,5 +170,5 @@ def _splat_bins(samples: Samples, centres: tuple[float, ...], bank: PsfBank) -> 
 
 def _splat_about(values: Tensor, one: Samples, bank: PsfBank) -> Tensor:
     """Splat ``(B, C, H, W)`` about the pinhole positions of one sample of each pixel."""
-    shift = pinhole_position(one) - _pixels(values)
+    shift = pinhole_position(one) - pixel_positions(values)
     return splat_samples([(values, Labels(coc=one.coc, motion=one.motion, offset=shift))], bank)

@@ -9,8 +9,12 @@ import torch
 from torch import Tensor
 
 import torchbokeh
+from torchbokeh.bank_splatting import bank_of_motion, splat_bank
+from torchbokeh.layers import bin_centres
 from torchbokeh.ops._dispatch import numba_is_there
+from torchbokeh.ops.composite import bin_weights
 from torchbokeh.psfs import PsfBank
+from torchbokeh.psfs.model import Labels
 from torchbokeh.report.experiments import Row, Say
 from torchbokeh.report.measure import Work, displayed, errors, measure
 from torchbokeh.report.methods import QUALITIES
@@ -20,7 +24,15 @@ from torchbokeh.scenes import RECIPES, samples
 
 DENSE = "dense scatter of capsules"
 
+DENSE_LAYERS = "dense scatter of capsules, layers"
+
 FILTER = "filter with capsules"
+
+LKS_LAYERS = 8
+"""Bins of constant parallax, at most."""
+
+Keep = Callable[[str, str, Tensor], None]
+"""Is given the name of a scene, what a picture is, and the picture ``(1, 3, H, W)``."""
 
 RECIPES_IN_MOTION = ("whirl", "coins", "rain", "gears")
 """Recipes that go by the names of the scenes of LKS."""
@@ -73,7 +85,8 @@ class _Scene:
 
     seen: dict[str, Tensor]
     coc: Tensor
-    blur_of: Callable[[str], torchbokeh.LensBlur]
+    layer_coc: Tensor
+    lens: torchbokeh.ThinLens
     noisy: torchbokeh.Samples
     truth: Tensor
 
@@ -83,19 +96,81 @@ def _scene(name: str, settings: Settings) -> _Scene:
     scene, camera = RECIPES[name](0, size=size, blur=settings.truth_radius)
     seen = {key: t[None] for key, t in scene.render(camera).items()}
     truth = torchbokeh.AccumulationBuffer(views=2 * settings.truth_views)(scene, camera)[:, :3]
-    coc = camera.lens.coc(seen["depth"], size[1])
-    return _Scene(seen, coc, partial(_blur, camera.lens), samples(scene, camera, 1, 0), truth)
+    coc, layer_coc = (camera.lens.coc(seen[key], size[1]) for key in ("depth", "layer_depth"))
+    return _Scene(seen, coc, layer_coc, camera.lens, samples(scene, camera, 1, 0), truth)
 
 
-def _blur(lens: torchbokeh.ThinLens, quality: str) -> torchbokeh.LensBlur:
-    return torchbokeh.LensBlur(lens, quality=quality)
+def _synthesis(scene: _Scene) -> dict[str, Work]:
+    from torchbokeh.report.capsules import dense_capsules, dense_layers, filter_capsules
+
+    seen = scene.seen
+    pinhole, layers = (
+        (seen["image"], scene.coc, seen["motion"]),
+        (seen["layers"], scene.layer_coc, seen["layer_motion"]),
+    )
+    works: dict[str, Work] = {
+        DENSE: partial(dense_capsules, *pinhole),
+        DENSE_LAYERS: partial(dense_layers, *layers),
+        FILTER: partial(filter_capsules, *pinhole),
+        "bank, image, re-weighted bins": partial(_reweighted_bins, *pinhole),
+        "bank, layers, re-weighted": partial(_reweighted_layers, *layers),
+    }
+    for quality in ("exact", "balanced"):
+        blur = torchbokeh.LensBlur(scene.lens, quality=quality)
+        works[f"LensBlur, image, {quality}"] = partial(blur, seen["image"], seen["depth"], motion=seen["motion"])
+        layered = partial(blur, seen["layers"], seen["layer_depth"], motion=seen["layer_motion"])
+        works[f"LensBlur, layers, {quality}"] = layered
+    return works
 
 
-def like_lks(settings: Settings, say: Say) -> list[Row]:
+def _reweighted_bins(image: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
+    """Soft layers of constant parallax, as LKS composes them: see `torchbokeh.report.capsules.over_reweighted`."""
+    from torchbokeh.report.capsules import over_reweighted
+
+    bank, labels = bank_of_motion(image.device), Labels(coc, motion=motion)
+    rgba, centres = torch.cat([image, torch.ones_like(coc)], 1), bin_centres(*map(float, coc.aminmax()), LKS_LAYERS)
+    return over_reweighted([splat_bank(rgba * weight, labels, bank) for weight in bin_weights(coc, centres)])
+
+
+def _reweighted_layers(layers: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
+    """The same with layers that are known."""
+    from torchbokeh.report.capsules import over_reweighted
+
+    bank = bank_of_motion(layers.device)
+    every = zip(layers.unbind(1), coc.unbind(1), motion.unbind(1), strict=True)
+    return over_reweighted([splat_bank(rgba, Labels(radius, motion=way), bank) for rgba, radius, way in every])
+
+
+def _reconstruction(scene: _Scene) -> dict[str, Work]:
+    from torchbokeh.report.capsules import dense_samples
+
+    mean = scene.noisy.colour[:, 0]
+    works: dict[str, Work] = {"one sample per pixel": mean.clone, DENSE: partial(dense_samples, scene.noisy)}
+    for layers in (1, 4):
+        works[f"reconstruct, {layers} layers"] = partial(torchbokeh.reconstruct, scene.noisy, layers=layers)
+    works["non-local means"] = partial(non_local_means, mean, scene.truth)
+    return works
+
+
+KINDS: dict[str, Callable[[_Scene], dict[str, Work]]] = {
+    "synthesis": _synthesis,
+    "reconstruction": _reconstruction,
+}
+
+
+def like_lks(
+    settings: Settings, say: Say, keep: Keep | None = None, kinds: tuple[str, ...] = tuple(KINDS)
+) -> list[Row]:
     """Tables 2 and 3 of LKS with recipes of this package: synthesis, and reconstruction from one sample per pixel.
 
-    The truth is the accumulation buffer. ``times_dense`` is the time of the dense scatter of the pinhole picture over
-    that of the method, for synthesis. Nothing without numba.
+    The truth is the accumulation buffer. ``times_dense`` is the time of the dense scatter over that of the method: of
+    the pinhole picture, of its layers for what takes layers, and of the samples. Nothing without numba.
+
+    Args:
+        settings: sizes and repetitions.
+        say: is told in a line what comes next.
+        keep: is given the scene, the method and the picture of every row, and the truth.
+        kinds: of `KINDS`.
     """
     if not numba_is_there():
         return []
@@ -103,37 +178,19 @@ def like_lks(settings: Settings, say: Say) -> list[Row]:
     for name in RECIPES_IN_MOTION:
         say(f"synthesis and reconstruction with motion: {name}, {settings.truth_size} px")
         scene = _scene(name, settings)
-        for kind, works in (("synthesis", _synthesis(scene)), ("reconstruction", _reconstruction(scene))):
-            timings = measure(works, settings.repeat, settings.sweep_budget)
+        if keep is not None:
+            keep(name, "truth", scene.truth)
+        for kind in kinds:
+            timings = measure(KINDS[kind](scene), settings.repeat, settings.sweep_budget)
             for method, timing in timings.items():
-                ratio = timings[DENSE].row["seconds"] / timing.row["seconds"] if kind == "synthesis" else None
+                beside = DENSE_LAYERS if "layers" in method and kind == "synthesis" else DENSE
+                ratio = timings[beside].row["seconds"] / timing.row["seconds"]
                 row = {"scene": name, "kind": kind, "method": method, **timing.row, "times_dense": ratio}
                 border = min(int(settings.truth_radius) + 1, (settings.truth_size - 8) // 2)
                 rows.append(row | errors(timing.result[:, :3], scene.truth, border))
+                if keep is not None:
+                    keep(name, f"{kind}: {method}", timing.result[:, :3])
     return rows
-
-
-def _synthesis(scene: _Scene) -> dict[str, Work]:
-    from torchbokeh.report.capsules import dense_capsules, filter_capsules
-
-    seen = scene.seen
-    pinhole = seen["image"], scene.coc, seen["motion"]
-    works: dict[str, Work] = {DENSE: partial(dense_capsules, *pinhole), FILTER: partial(filter_capsules, *pinhole)}
-    for quality in ("exact", "balanced"):
-        blur = scene.blur_of(quality)
-        works[f"LensBlur, image, {quality}"] = partial(blur, seen["image"], seen["depth"], motion=seen["motion"])
-        layered = partial(blur, seen["layers"], seen["layer_depth"], motion=seen["layer_motion"])
-        works[f"LensBlur, layers, {quality}"] = layered
-    return works
-
-
-def _reconstruction(scene: _Scene) -> dict[str, Work]:
-    mean = scene.noisy.colour[:, 0]
-    works: dict[str, Work] = {"one sample per pixel": mean.clone}
-    for layers in (1, 4):
-        works[f"reconstruct, {layers} layers"] = partial(torchbokeh.reconstruct, scene.noisy, layers=layers)
-    works["non-local means"] = partial(non_local_means, mean, scene.truth)
-    return works
 
 
 def non_local_means(image: Tensor, truth: Tensor) -> Tensor:

@@ -282,23 +282,30 @@ def _motion(rows: list[Row]) -> str:
     return _section("Defocus with motion", about, table(head, cells))
 
 
-def _like_lks(rows: list[Row], settings: Row) -> str:
-    if not rows:
-        return ""
+def like_lks_table(rows: list[Row]) -> str:
+    """The rows of `torchbokeh.report.experiments_motion.like_lks` as a Markdown table."""
     head = ["scene", "kind", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
     cells = [
         [row["scene"], row["kind"], row["method"], seconds(row["seconds"]), _number(row["times_dense"], ".1f")]
         + [_number(row[key], form) for key, form in (("ssim", ".4f"), ("psnr", ".1f"), ("l1", ".4f"))]
         for row in rows
     ]
+    return table(head, cells)
+
+
+def _like_lks(rows: list[Row], settings: Row) -> str:
+    if not rows:
+        return ""
     size = settings["truth_size"]
     about = (
         f"Tables 2 and 3 of LKS with recipes of this package, {size} x {size}, radius up to "
         f"{settings['truth_radius']:g} px: synthesis from the pinhole picture or its layers, and reconstruction from "
-        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. The time "
-        "of non-local means is that of five strengths, of which the best one counts."
+        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. Times are "
+        "beside the dense scatter of the same input: picture, layers or samples. Re-weighted: layers over one "
+        "another, as LKS composes them after Lee et al. (2008). The time of non-local means is that of five "
+        "strengths, of which the best one counts."
     )
-    return _section("Synthesis and reconstruction", about, table(head, cells))
+    return _section("Synthesis and reconstruction", about, like_lks_table(rows))
 
 
 def _left_out(rows: list[Row], settings: Row) -> str:

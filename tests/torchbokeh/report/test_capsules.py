@@ -9,7 +9,8 @@ pytest.importorskip("numba")
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.psfs import Disc
 from torchbokeh.psfs.combined import capsule
-from torchbokeh.report.capsules import dense_capsules, filter_capsules
+from torchbokeh.reconstruction import Samples
+from torchbokeh.report.capsules import dense_capsules, dense_layers, dense_samples, filter_capsules, over_reweighted
 
 
 def picture(n, radius, dx, dy):
@@ -59,3 +60,34 @@ def test_the_filter_is_the_scatter_where_all_capsules_are_the_same():
     uneven = motion * torch.rand(1, 1, 40, 50)
     torch.testing.assert_close(filter_capsules(torch.ones_like(image), coc, uneven), torch.ones_like(image))
     assert float((filter_capsules(image, coc, uneven) - dense_capsules(image, coc, uneven)).abs().max()) > 0.01
+
+
+def test_layers_that_hold_a_picture_are_the_picture():
+    image, coc, motion = torch.rand(1, 3, 40, 50), torch.full((1, 1, 40, 50), 4.5), torch.ones(1, 2, 40, 50) * 6
+    opaque = torch.cat([image, torch.ones_like(coc)], 1)
+    empty = torch.zeros_like(opaque)
+    got = dense_layers(torch.stack([empty, opaque], 1), torch.stack([coc, coc], 1), torch.stack([motion, motion], 1))
+    torch.testing.assert_close(got, dense_capsules(image, coc, motion), atol=1e-5, rtol=1e-5)
+
+
+def test_over_stays_within_its_colours():
+    front, back = torch.rand(1, 4, 6, 7), torch.rand(1, 4, 6, 7)
+    for layer in (front, back):
+        layer[:, 3:] = layer[:, 3:] * 1.5
+        layer[:, :3] = 0.6 * layer[:, 3:]
+    torch.testing.assert_close(over_reweighted([front, back]), torch.full((1, 3, 6, 7), 0.6))
+
+
+def test_samples_in_the_middle_of_everything_are_the_picture():
+    image, coc, motion = torch.rand(1, 3, 20, 30), torch.full((1, 1, 20, 30), 3.5), torch.ones(1, 2, 20, 30) * 4
+    at = torch.stack(torch.meshgrid(torch.arange(30.0), torch.arange(20.0), indexing="xy"))[None]
+    zero, here = torch.zeros(1, 2, 20, 30), torch.ones(1, 1, 20, 30, dtype=torch.bool)
+    samples = Samples(*(t[:, None] for t in (image, at, zero, zero[:, :1], coc, motion, here)))
+    want = dense_capsules(image, coc, motion)
+    torch.testing.assert_close(dense_samples(samples), want, atol=1e-5, rtol=1e-5)
+    lens, time = torch.tensor([0.4, -0.3]).view(1, 1, 2, 1, 1), torch.full((1, 1, 1, 1, 1), 0.25)
+    moved = samples._replace(lens=lens.expand(1, 1, 2, 20, 30), time=time.expand(1, 1, 1, 20, 30))
+    # All belong to a place 2.4 px to the left and at the height of their pixel: 3.5 * 0.4 + 0.25 * 4, and 0.05 above.
+    inside = (..., slice(6, -6), slice(8, -12))
+    shifted = 0.6 * want.roll(-2, 3) + 0.4 * want.roll(-3, 3)
+    assert float((dense_samples(moved)[inside] - shifted[inside]).abs().max()) < 0.02

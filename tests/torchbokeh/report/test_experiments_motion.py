@@ -1,6 +1,6 @@
 import torch
 
-from torchbokeh.report.experiments_motion import DENSE, FILTER, RECIPES_IN_MOTION, spinning
+from torchbokeh.report.experiments_motion import DENSE, DENSE_LAYERS, FILTER, RECIPES_IN_MOTION, spinning
 from torchbokeh.report.methods import QUALITIES
 
 
@@ -30,4 +30,5 @@ def test_synthesis_and_reconstruction_are_those_of_the_paper(report):
         assert found[name, FILTER]["ssim"] > 0.3
         assert found[name, "LensBlur, layers, exact"]["ssim"] > 0.6
         assert found[name, "reconstruct, 4 layers"]["ssim"] > found[name, "one sample per pixel"]["ssim"]
-        assert found[name, "non-local means"]["times_dense"] is None
+        assert found[name, DENSE_LAYERS]["times_dense"] == 1
+        assert found[name, "bank, layers, re-weighted"]["ssim"] > 0.5
