@@ -1,6 +1,7 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
 from collections.abc import Sequence
+from functools import partial
 from numbers import Real
 
 import torch
@@ -11,10 +12,8 @@ from torchbokeh._signed import signed_coc, signed_map
 from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
-    FOREGROUND,
     Moving,
     Surface,
-    bin_centres,
     compose,
     foreground_over_rest,
     split_foreground,
@@ -23,14 +22,13 @@ from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.convolve import blur_uniform, blur_with
-from torchbokeh.ops.merge import highest_level
-from torchbokeh.ops.spans import MIN_RADIUS, Profile, subdivide
-from torchbokeh.plan import Hidden, Plan, Seen
+from torchbokeh.ops.spans import Profile, subdivide
+from torchbokeh.plan import Plan
+from torchbokeh.planning import Moves, Wishes, decide, look_at
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
 from torchbokeh.psfs.combined import STILL, turned_capsule
-from torchbokeh.quality import QUALITIES, Quality, check_quality, choose, merged_shares
+from torchbokeh.quality import check_quality
 
-Moves = tuple[float, tuple[float, float] | None, float]
 Background = Tensor | tuple[Tensor, Tensor] | None
 
 
@@ -146,88 +144,8 @@ class LensBlur(nn.Module):
         return found
 
     def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves, background: bool) -> Plan:
-        with torch.no_grad():
-            if image.numel() == 0:
-                raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
-            if image.dim() == 5:
-                return self._plan_layers(image, signed, cut, moves)
-            *_, height, width = image.shape
-            share = signed.new_zeros(()) if cut is None else cut.to(signed.dtype).mean()
-            look = [*signed.aminmax(), share, *self._shares(signed)]
-            low, high, clamped, *shares = torch.stack(look).tolist()
-            quality, error = choose(self.quality, self.tolerance, shares)
-            start, stop = FOREGROUND
-            most = self.layers or quality.bins
-            in_front = low < stop and high > start and high - low > 1
-            hidden: Hidden = "nothing"
-            bins: tuple[tuple[float, ...], ...]
-            if in_front:
-                ahead = self.layers or (1 if quality.coarse else quality.bins)
-                bins = bin_centres(low, stop, ahead), bin_centres(start, high, most)
-                hidden = "given" if background else "filled"
-            else:
-                bins = (bin_centres(low, high, most),)
-            occludes = in_front or len(bins[0]) > 1
-            seen = Seen((height, width), (low, high), clamped, *moves, 0, (), ())
-            return self._finish(seen, hidden, bins, occludes, quality, error)
-
-    def _shares(self, signed: Tensor) -> list[Tensor]:
-        return merged_shares(signed, self.quality, self.tolerance)
-
-    def _plan_layers(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves) -> Plan:
-        *_, height, width = image.shape
-        held = image[:, :, 3:] > 0
-        low = torch.where(held, signed, torch.inf).movedim(1, 0).flatten(1).amin(1)
-        high = torch.where(held, signed, -torch.inf).movedim(1, 0).flatten(1).amax(1)
-        share = low.new_zeros(()) if cut is None else (cut & held).sum() / held.sum().clamp_min(1)
-        shares = self._shares(torch.where(held, signed, 0.0))
-        least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(low.dtype)
-        look = torch.cat([low, high, least, torch.stack([share.to(low.dtype), *shares])]).tolist()
-        bounds, (clamped, *merged) = look[: -len(QUALITIES) - 1], look[-len(QUALITIES) - 1 :]
-        quality, error = choose(self.quality, self.tolerance, merged)
-        count = image.shape[1]
-        kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
-        opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
-        most = self.layers or quality.bins
-        bins = tuple(bin_centres(bounds[k], bounds[count + k], most) for k in kept)
-        span = (min((bounds[k] for k in kept), default=0.0), max((bounds[count + k] for k in kept), default=0.0))
-        occludes = len(kept) > 1 or any(len(b) > 1 for b in bins)
-        seen = Seen((height, width), span, clamped, *moves, count, kept, opaque)
-        return self._finish(seen, "layers", bins, occludes, quality, error)
-
-    def _finish(
-        self,
-        seen: Seen,
-        hidden: Hidden,
-        bins: tuple[tuple[float, ...], ...],
-        occludes: bool,
-        quality: Quality,
-        error: float,
-    ) -> Plan:
-        largest = max(abs(seen.coc_range[0]), abs(seen.coc_range[1]))
-        if seen.moves:
-            pieces = 1
-        elif self.subapertures is not None:
-            pieces = self.subapertures
-        elif not occludes or largest < 3:
-            pieces = 1
-        else:
-            pieces = quality.subapertures[hidden in ("given", "layers")]
-        merging = quality.merging
-        highest = 0 if merging is None else highest_level(largest, seen.size, merging)
-        sharp = largest <= MIN_RADIUS and hidden != "layers" and not seen.moves
-        aperture = repr(self.aperture)
-        return Plan(
-            **vars(seen),
-            sharp=sharp,
-            hidden=hidden,
-            bins=bins,
-            subapertures=pieces,
-            aperture=aperture,
-            quality=quality,
-            highest=highest,
-            predicted_error=error,
-        )
+        wishes = Wishes(self.quality, self.tolerance, self.layers, self.subapertures, repr(self.aperture))
+        return decide(look_at(image, signed, cut, wishes), moves, wishes, background=background)
 
     def forward(
         self,
@@ -283,10 +201,7 @@ class LensBlur(nn.Module):
             merging = plan.quality.merging
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             still = moves is None and ends is None
-
-            def moving(layer: int | None = None) -> Moving | None:
-                return moving_picture(image, moves, ends, plan.parts, self.shutter, layer)
-
+            moving = partial(moving_picture, image, moves, ends, plan.parts, self.shutter)
             if image.dim() == 5:
 
                 def alpha(k: int) -> Tensor | None:
