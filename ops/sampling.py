@@ -5,12 +5,12 @@ from torch import Tensor
 
 from torchbokeh.ops.spans import Profile, edges_at
 
-DIMENSIONS = 5
-"""Columns of `halton`: bases 2, 3, 5, 7, 11."""
+DIMENSIONS = 6
+"""Columns of `halton`: bases 2, 3, 5, 7, 11, 13."""
 
 
 def halton(count: int, *, first: int = 0, seed: int | None = None) -> Tensor:
-    """Points ``first`` to ``first + count`` of the Halton sequence in bases 2, 3, 5, 7 and 11.
+    """Points ``first`` to ``first + count`` of the Halton sequence in bases 2, 3, 5, 7, 11 and 13.
 
     Any run of consecutive points is spread evenly by itself. The point at the origin is left out.
 
@@ -21,7 +21,7 @@ def halton(count: int, *, first: int = 0, seed: int | None = None) -> Tensor:
             are as even and independent of the plain ones; ``None`` for the plain ones.
 
     Returns:
-        ``(count, 5)`` in [0, 1), double.
+        ``(count, 6)`` in [0, 1), double.
 
     Raises:
         ValueError: a negative number.

@@ -13,6 +13,9 @@ if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None
 
 from torchbokeh import scenes
 from torchbokeh.accumulation import AccumulationBuffer
+from torchbokeh.chromatic import ChromaticAccumulation
+from torchbokeh.dispersion import Dispersion
+from torchbokeh.field_map import FieldMap
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
 from torchbokeh.kernel_splatting import KernelSplatting, SplattingPlan
 from torchbokeh.lens import DisparityLens, Lens, ThinLens
@@ -26,10 +29,13 @@ __version__ = "0.1.0"
 __all__ = [
     "AccumulationBuffer",
     "Aperture",
+    "ChromaticAccumulation",
     "Disc",
     "DisparityLens",
+    "Dispersion",
     "Ellipse",
     "FFTIntegrator",
+    "FieldMap",
     "KernelSplatting",
     "Lens",
     "LensBlur",

@@ -24,15 +24,12 @@ def ways(motion: Motion) -> tuple[Tensor, ...]:
     return (motion,) if isinstance(motion, Tensor) else tuple(motion)
 
 
-def look_at_motion(
-    image: Tensor, motion: Motion, ends: Tensor | None = None
-) -> tuple[float, tuple[float, float] | None, float]:
-    """Check the motion; return the longest way in px, the displacement that all pixels share, if they do, and the
-    largest change of a signed radius in px from one of the ``ends`` to the other.
+def check_motion(image: Tensor, motion: Motion) -> None:
+    """Check the kind and the shape of a motion.
 
     Raises:
         TypeError: it is no floating-point tensor, and no sequence of such.
-        ValueError: a shape, device or value does not fit.
+        ValueError: a shape or device does not fit.
     """
     if motion is not None and not isinstance(motion, Tensor | Sequence):
         raise TypeError(f"motion: expected a tensor, a sequence of tensors or None, got {type(motion).__name__}")
@@ -41,6 +38,22 @@ def look_at_motion(
         raise ValueError("motion: expected at least one displacement, got an empty sequence")
     for way in found:
         check_image("motion", way, (*image.shape[:-3], 2, *image.shape[-2:]), like=image)
+
+
+def look_at_motion(
+    image: Tensor, motion: Motion, ends: Tensor | None = None
+) -> tuple[float, tuple[float, float] | None, float]:
+    """The longest way in px, the displacement that all pixels share, if they do, and the largest change of a radius.
+
+    Args:
+        image: the picture.
+        motion: as `check_motion` found it good.
+        ends: signed radius in px when the shutter opens and when it closes.
+
+    Raises:
+        ValueError: the motion is not finite.
+    """
+    found = ways(motion)
     if image.numel() == 0 or (not found and ends is None):
         return 0.0, None, 0.0
     with torch.no_grad():

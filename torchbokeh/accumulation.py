@@ -9,6 +9,7 @@ from torchbokeh.layer_views import accumulate_layers
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.prism import Prism
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene
@@ -125,15 +126,14 @@ class AccumulationBuffer(nn.Module):
             TypeError: an argument of the wrong kind.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        views = Views.spread(self.views, self.aperture.profile(), first=self.first, seed=self.seed)
-        settings = {"reuse": self.reuse, "subsamples": self.subsamples}
+        settings = {"level_of_detail": self.level_of_detail, "reuse": self.reuse, "subsamples": self.subsamples}
         if isinstance(source, Scene):
             if not isinstance(depth, Camera):
                 raise TypeError(f"depth: expected a Camera beside the scene, got {type(depth).__name__}")
             for name, value in (("lens", self.lens), ("coc", coc), ("motion", motion)):
                 if value is not None:
                     raise ValueError(f"{name}: expected None for a scene, got {type(value).__name__}")
-            return accumulate_scene(source, depth, views, level_of_detail=self.level_of_detail, **settings)
+            return accumulate_scene(source, depth, *self._spread(depth.lens, depth.size), **settings)
         if not isinstance(source, Tensor):
             raise TypeError(f"source: expected a Scene, with its Camera, or layers, got {type(source).__name__}")
         check_image("source", source, ("B", "L", 4, "H", "W"))
@@ -145,8 +145,13 @@ class AccumulationBuffer(nn.Module):
         dtype = compute_dtype(source, signed)
         layers, radii = source.to(dtype), signed.to(dtype)
         moved = None if motion is None else motion.to(dtype)
-        out = accumulate_layers(layers, radii, moved, views, level_of_detail=self.level_of_detail, **settings)
+        views, prism = self._spread(self.lens, (source.shape[3], source.shape[4]))
+        out = accumulate_layers(layers, radii, moved, views, prism, **settings)
         return out.to(source.dtype)
+
+    def _spread(self, lens: Lens | None, size: tuple[int, int]) -> tuple[Views, Prism | None]:
+        """The views, and what a lens does to their wavelengths where these are told apart."""
+        return Views.spread(self.views, self.aperture.profile(), first=self.first, seed=self.seed), None
 
 
 def _whole(name: str, value: int, low: int) -> int:

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchbokeh.field_map import Field
 from torchbokeh.layers import continued
 from torchbokeh.ops.planes import pixel_centres
 from torchbokeh.ops.raycast import subsample_blur
+from torchbokeh.prism import Prism
 from torchbokeh.views import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
 
 STEPS = 4
@@ -39,19 +41,27 @@ class Layer:
             odd = (0, self.levels[-1].shape[3] % 2, 0, self.levels[-1].shape[2] % 2)
             self.levels.append(F.avg_pool2d(F.pad(self.levels[-1], odd, mode="replicate"), 2))
 
-    def view(self, lens: Tensor, time: float, level: int) -> tuple[Tensor, Tensor]:
-        """The layer as one view has it: RGBA ``(B, 4, H, W)`` and its signed CoC ``(B, 1, H, W)``."""
+    def view(self, lens: Tensor, time: float, level: int, more: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The layer as one view has it: RGBA ``(B, 4, H, W)`` and its signed CoC ``(B, 1, H, W)``.
+
+        ``more (2, H, W)`` is how far in px it moves pixels beside.
+        """
         h, w = self.field.shape[2:]
         x, y = pixel_centres((h, w), self.field)
         pixel = torch.stack([x, y], -1).expand(len(self.field), h, w, 2)
-        here, field = pixel, self.field
+        moves = self.field
+        if more is not None:
+            moves = torch.cat([self.field, more.to(self.field).expand(len(self.field), -1, -1, -1)], 1)
+        here, field = pixel, moves
         # The point that comes to lie on a pixel solves `here + parallax(here) = pixel`.
-        for _ in range(1 if self.even else STEPS):
+        for _ in range(1 if self.even and more is None else STEPS):
             move = field[:, :1] * lens[:, None, None]
-            if field.shape[1] == 3:
-                move = move + field[:, 1:] * time
+            if self.field.shape[1] == 3:
+                move = move + field[:, 1:3] * time
+            if more is not None:
+                move = move + field[:, -2:]
             here = pixel - move.movedim(1, -1)
-            field = _at(self.field, here, 1)
+            field = _at(moves, here, 1)
         return _at(self.levels[level], here, 2**level), field[:, :1]
 
 
@@ -66,12 +76,16 @@ def accumulate_layers(
     coc: Tensor,
     motion: Tensor | None,
     views: Views,
+    prism: Prism | None = None,
     *,
     level_of_detail: float,
     reuse: int,
     subsamples: int,
 ) -> Tensor:
-    """The mean of the views ``(B, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
+    """The mean of the views ``(B, 4, H, W)``, or their sum in the colours of a prism.
+
+    See `torchbokeh.AccumulationBuffer` and `torchbokeh.ChromaticAccumulation`.
+    """
     b, count, _, h, w = layers.shape
     if layers.numel() == 0:
         return layers.new_zeros(b, 4, h, w)
@@ -79,7 +93,7 @@ def accumulate_layers(
         moved = [None] * b if motion is None else motion.split(1)
         settings: dict[str, Any] = {"level_of_detail": level_of_detail, "reuse": reuse, "subsamples": subsamples}
         each = zip(layers.split(1), coc.split(1), moved, strict=True)
-        return torch.cat([accumulate_layers(*one, views, **settings) for one in each])
+        return torch.cat([accumulate_layers(*one, views, prism, **settings) for one in each])
     offsets, scale = subsample_offsets(views.lens, subsamples)
     # The pixels of the input are means already: shifting them would only blur them once more.
     views = Views(views.lens * scale, views.time, torch.zeros_like(views.shift))
@@ -95,10 +109,14 @@ def accumulate_layers(
     level = torch.zeros(len(views), len(kept), dtype=torch.long)
     if level_of_detail:
         most = torch.full_like(low, min(LEVELS, max(layers.shape[3:]).bit_length()) - 1)
-        level = detail_levels(smallest_radius(low, high), torch.ones_like(low), level_of_detail, len(views), most)
+        below, above = (0.0, 0.0) if prism is None else prism.shifts()
+        radius = smallest_radius(low + below, high + above)
+        level = detail_levels(radius, torch.ones_like(low), level_of_detail, len(views), most)
     parents = torch.arange(len(views))[:, None].expand_as(level)
     if reuse:
-        parents = shared_views(views, largest_coc(low, high), speed, reuse, level)
+        # Only views of one wavelength move a layer alike.
+        kinds = level if prism is None else level + (LEVELS + 1) * prism.kinds()[:, None]
+        parents = shared_views(views, largest_coc(low, high), speed, reuse, kinds)
     ready = [
         Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
         for i, k in enumerate(kept)
@@ -106,15 +124,16 @@ def accumulate_layers(
     last = {(i, p): v for v, row in enumerate(parents.tolist()) for i, p in enumerate(row)}
     copies: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
     total = torch.zeros_like(layers[:, 0])
+    field = Field.pixels((h, w), 0, coc)
     for v in range(len(views)):
         left = torch.ones_like(total[:, 3:])
         picture, front, most_seen = torch.zeros_like(total), torch.zeros_like(left), torch.zeros_like(left)
         for i, layer in enumerate(ready):
             key = (i, int(parents[v, i]))
             if key not in copies:
-                copies[key] = layer.view(
-                    views.lens[key[1]].to(layers), float(views.time[key[1]]), int(level[key[1], i])
-                )
+                point = views.lens[key[1]].to(layers)
+                more = None if prism is None else prism.movement(key[1], point, field)
+                copies[key] = layer.view(point, float(views.time[key[1]]), int(level[key[1], i]), more)
             rgba, radius = copies[key]
             if last[key] == v:
                 del copies[key]
@@ -125,5 +144,6 @@ def accumulate_layers(
                 front = torch.where(visible >= most_seen, radius, front)
                 most_seen = torch.maximum(most_seen, visible)
             left = left * (1 - rgba[:, 3:])
-        total = total + (subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture)
-    return total / len(views)
+        picture = subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture
+        total = total + (picture if prism is None else picture * prism.weights[v].to(picture)[:, None, None])
+    return total / len(views) if prism is None else total

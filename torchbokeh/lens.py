@@ -5,10 +5,14 @@ from abc import ABC, abstractmethod
 from numbers import Real
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from torchbokeh.dispersion import Dispersion
+from torchbokeh.field_map import Field
+from torchbokeh.held import Held, check_parameter
 
 
-class Lens(nn.Module, ABC):
+class Lens(Held, ABC):
     """What every lens can do: turn depth into a signed CoC radius in pixels, and back.
 
     A lens parameter is a scalar, or ``(B,)`` with one value for each item of the batch, the first dimension
@@ -19,6 +23,8 @@ class Lens(nn.Module, ABC):
     Maps have shape ``(B, 1, H, W)``, or any ``(..., H, W)``; parameters of shape ``(B,)`` with B > 1 need the
     batch dimension. Results have the shape of the map and its dtype, but float32 for half precision.
     """
+
+    dispersion: Dispersion | None
 
     @abstractmethod
     def coc(self, depth: Tensor, width: int) -> Tensor:
@@ -31,42 +37,6 @@ class Lens(nn.Module, ABC):
     def forward(self, depth: Tensor, width: int) -> Tensor:
         """Same as :meth:`coc`."""
         return self.coc(depth, width)
-
-    def extra_repr(self) -> str:
-        """Name and value of every parameter."""
-        return ", ".join(f"{name}={_show(value)}" for name, value in self._values().items())
-
-    def _values(self) -> dict[str, Tensor]:
-        """Every parameter and buffer, in the order in which :meth:`_hold` got them."""
-        return {name: getattr(self, name) for name in self._names}
-
-    def _hold(self, **values: float | Tensor) -> None:
-        """Keep lens parameters: numbers and tensors as buffers, an ``nn.Parameter`` as the one it is."""
-        # Numbers join the tensors' device: a focus distance predicted on a GPU needs no further .to().
-        device = next((v.device for v in values.values() if isinstance(v, Tensor)), None)
-        batched: tuple[str, int] | None = None
-        self._names = tuple(values)
-        for name, value in values.items():
-            if isinstance(value, Real) and not isinstance(value, bool):
-                value = torch.tensor(float(value), dtype=torch.float32, device=device)
-            elif not isinstance(value, Tensor):
-                raise TypeError(f"{name}: expected a number or a tensor, got {type(value).__name__}")
-            if not value.is_floating_point():
-                raise TypeError(f"{name}: expected a floating-point tensor, got {value.dtype}")
-            if value.device != device and device is not None:
-                raise ValueError(f"{name}: expected device {device}, got {value.device}")
-            if value.dim() > 1:
-                raise ValueError(f"{name}: expected a scalar or shape (B,), got {tuple(value.shape)}")
-            if value.dim() == 1:
-                batched = batched or (name, len(value))
-                if len(value) != batched[1]:
-                    raise ValueError(
-                        f"{name}: expected a scalar or shape ({batched[1]},) like {batched[0]}, got ({len(value)},)"
-                    )
-            if isinstance(value, nn.Parameter):
-                self.register_parameter(name, value)
-            else:
-                self.register_buffer(name, value)
 
     def _align(self, name: str, x: Tensor, width: int) -> list[Tensor]:
         """Check a map and the image width; return the map and the parameters, all ready to broadcast."""
@@ -110,8 +80,9 @@ class ThinLens(Lens):
         f_number: N, > 0; the aperture is ``F / N`` wide.
         focus_distance: df, in metres from the lens, > F; ``inf`` focuses on infinity.
         sensor_width: in metres, > 0; the image's ``width`` pixels cover it.
+        dispersion: chromatic aberration; ``None`` for none.
 
-    Each is a number, a 0-d or ``(B,)`` floating-point tensor, or an ``nn.Parameter``. Numbers are held in
+    Each but the last is a number, a 0-d or ``(B,)`` floating-point tensor, or an ``nn.Parameter``. Numbers are held in
     float32; give float64 tensors where the last digits count.
 
     Raises:
@@ -140,6 +111,8 @@ class ThinLens(Lens):
         f_number: float | Tensor,
         focus_distance: float | Tensor,
         sensor_width: float | Tensor,
+        *,
+        dispersion: Dispersion | None = None,
     ) -> None:
         super().__init__()
         self._hold(
@@ -150,12 +123,15 @@ class ThinLens(Lens):
         )
         for name in ("focal_length", "f_number", "sensor_width"):
             value = getattr(self, name)
-            _check_parameter(name, value, (value > 0) & value.isfinite(), "a positive finite value")
+            check_parameter(name, value, (value > 0) & value.isfinite(), "a positive finite value")
         focus, focal = torch.broadcast_tensors(self.focus_distance, self.focal_length)
         nearest = focal[~(focus > focal)][:1].tolist()
         if nearest:
             want = f"more than the focal length ({nearest[0]:g} m)"
-            _check_parameter("focus_distance", focus, focus > focal, want)
+            check_parameter("focus_distance", focus, focus > focal, want)
+        if dispersion is not None and not isinstance(dispersion, Dispersion):
+            raise TypeError(f"dispersion: expected a Dispersion or None, got {type(dispersion).__name__}")
+        self.dispersion = dispersion
 
     @property
     def aperture_radius(self) -> Tensor:
@@ -215,6 +191,54 @@ class ThinLens(Lens):
         gain, focus = _optics(f, n, df, sensor, width)
         # The same product as coc() forms at infinity, so that its limit comes back as exactly 1 / inf.
         return _distance((gain * focus - c) / gain)
+
+    def coc_shift(self, wavelength: float, width: int, field: Field | None = None) -> Tensor:
+        """How much larger the signed CoC radius of a wavelength is than :meth:`coc`, in px, at every depth.
+
+        The sensor stays where it is, so ``1 / df(λ) = 1 / df + 1 / F(λ) - 1 / F``, which is (4.5) of the dissertation:
+        a sum of dioptres, whatever the depth. It needs no condition like (4.6): light that would be in focus beyond
+        infinity is blurred like any other.
+
+        Args:
+            wavelength: in nanometres.
+            width: width of the whole image in pixels.
+            field: where in the picture; ``None`` for the middle.
+
+        Returns:
+            Broadcasts with ``(B, 1, H, W)``; 0 without dispersion.
+
+        Example:
+            >>> lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=Dispersion("BK7", axial=0.5))
+            >>> round(lens.coc_shift(475.0, width=1920).item(), 2)
+            6.36
+        """
+        if self.dispersion is None:
+            return torch.zeros(())
+        gain, _ = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
+        parts = gain / self.focal_length, self.dispersion.power(wavelength, field)
+        dioptres, power = (t.view(-1, 1, 1, 1) if t.dim() == 1 else t for t in parts)
+        return dioptres * power
+
+    def focus_at(self, wavelength: float) -> Tensor:
+        """Focus distance of a wavelength in metres, in the middle of the picture: (4.5) of the dissertation.
+
+        Raises:
+            ValueError: it lies beyond infinity: condition (4.6) fails.
+
+        Example:
+            >>> lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=Dispersion("BK7"))
+            >>> round(lens.focus_at(475.0).item(), 3)
+            1.194
+        """
+        power = torch.zeros(()) if self.dispersion is None else self.dispersion.power(wavelength)
+        nearness = self.focus_distance.reciprocal() + power / self.focal_length
+        if not bool((nearness > 0).all()):
+            raise ValueError(
+                f"wavelength: expected one that is in focus at a finite distance, got {wavelength:g} nm, whose focal "
+                f"length is too long; focus nearer than {(-self.focal_length / power).min().item():g} m, or take it "
+                "as the reference of the dispersion"
+            )
+        return nearness.reciprocal()
 
     def hyperfocal(self, max_coc: float, width: int) -> Tensor:
         """Shortest focus distance that keeps infinity sharp.
@@ -297,9 +321,10 @@ class DisparityLens(Lens):
 
     def __init__(self, strength: float | Tensor, focus_disparity: float | Tensor) -> None:
         super().__init__()
+        self.dispersion = None
         self._hold(strength=strength, focus_disparity=focus_disparity)
         for name, value in self._values().items():
-            _check_parameter(name, value, value.isfinite(), "a finite value")
+            check_parameter(name, value, value.isfinite(), "a finite value")
 
     def coc(self, depth: Tensor, width: int) -> Tensor:
         """Signed CoC radius in pixels, positive behind the disparity in focus.
@@ -375,20 +400,8 @@ def _check_sharpness(max_coc: float, width: int) -> None:
     _check_width(width)
 
 
-def _check_parameter(name: str, value: Tensor, good: Tensor, want: str) -> None:
-    if not good.all():
-        raise ValueError(f"{name}: expected {want}, got {value[~good][0].item():g}")
-
-
 def _check_map(name: str, x: Tensor, good: Tensor, want: str) -> None:
     """Raise unless all values are good; one bool crosses to the host."""
     if not good.all():
         bad = x[~good].sort().values  # NaN sorts last, so the smallest is a number where there is one
         raise ValueError(f"{name}: expected {want}, got {len(bad)} bad of {x.numel()}, the smallest {bad[0].item():g}")
-
-
-def _show(value: Tensor) -> str:
-    if value.dim() == 0:
-        return f"{value.item():.6g}"
-    shown = [f"{v:.6g}" for v in value.detach()[:4].tolist()]
-    return f"({', '.join(shown)}{', ...' if len(value) > 4 else ''})"

@@ -7,8 +7,9 @@ from numbers import Real
 import torch
 from torch import Tensor, nn
 
-from torchbokeh._motion import ADVANCE, Motion, look_at_motion, moving_picture, ways
+from torchbokeh._motion import ADVANCE, Motion, check_motion, look_at_motion, moving_picture, ways
 from torchbokeh._signed import signed_coc, signed_map
+from torchbokeh.chromatic_blur import Given, blur_colours, plan_colours
 from torchbokeh.kernel_splatting import blur_one_layer
 from torchbokeh.layers import (
     COARSE,
@@ -24,7 +25,7 @@ from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.convolve import blur_uniform, blur_with
 from torchbokeh.ops.spans import Profile, subdivide
 from torchbokeh.plan import Plan
-from torchbokeh.planning import Moves, Wishes, decide, look_at
+from torchbokeh.planning import Wishes, decide, look_at
 from torchbokeh.psfs.aperture import Aperture, Disc, parse_aperture
 from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import check_quality
@@ -125,27 +126,18 @@ class LensBlur(nn.Module):
 
         One small copy from the device, which a forward pass with ``plan=`` saves.
         """
-        _, signed, cut = self._inputs(image, depth, coc, background)
-        ends = self._ends(image, shutter_depth, is_coc=coc is not None)
-        return self._plan(image, signed, cut, self._moves(image, motion, ends), background is not None)
+        given, cut = self._inputs(image, depth, coc, (motion, shutter_depth), background)
+        return self._plan(given, cut)
 
-    def _ends(self, image: Tensor, shutter_depth: Tensor | None, *, is_coc: bool) -> Tensor | None:
-        """Signed CoC when the shutter opens and when it closes."""
-        if shutter_depth is None:
-            return None
-        given = {"is_coc": is_coc, "margin": self.margin, "channels": 2}
-        ends = signed_map(self.lens, image, "shutter_depth", shutter_depth, **given)
-        return ends if self.max_coc is None else ends.clamp(-self.max_coc, self.max_coc)
-
-    def _moves(self, image: Tensor, motion: Motion, ends: Tensor | None) -> Moves:
-        found = look_at_motion(image, motion, ends)
-        if (motion is not None or ends is not None) and not isinstance(self.aperture, Disc):
-            raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
-        return found
-
-    def _plan(self, image: Tensor, signed: Tensor, cut: Tensor | None, moves: Moves, background: bool) -> Plan:
+    def _plan(self, given: Given, cut: Tensor | None) -> Plan:
         wishes = Wishes(self.quality, self.tolerance, self.layers, self.subapertures, repr(self.aperture))
-        return decide(look_at(image, signed, cut, wishes), moves, wishes, background=background)
+        look = look_at(given.image, given.signed, cut, wishes)
+        moves = look_at_motion(given.image, given.motion, given.ends)
+        plan = decide(look, moves, wishes, background=given.behind is not None)
+        if self.lens is None:
+            return plan
+        rest = {"margin": self.margin, "limit": self.max_coc}
+        return plan_colours(plan, look, moves, wishes, self.lens, given.signed, **rest)
 
     def forward(
         self,
@@ -183,50 +175,56 @@ class LensBlur(nn.Module):
             TypeError: an argument is not a floating-point tensor, or not a `Plan`.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        behind, signed, cut = self._inputs(image, depth, coc, background)
+        given, cut = self._inputs(image, depth, coc, (motion, shutter_depth), background)
         if image.numel() == 0:
             return self._cropped(image.clone() if image.dim() == 4 else image.sum(1))
-        ends = self._ends(image, shutter_depth, is_coc=coc is not None)
         if plan is None:
-            plan = self._plan(image, signed, cut, self._moves(image, motion, ends), background is not None)
-        self._check_plan(plan, image, (motion, ends), background)
+            plan = self._plan(given, cut)
+        self._check_plan(plan, given)
+        profile = self.aperture.profile()
+        if self.lens is None or not plan.colours:
+            return self._cropped(self._blur(given, plan, subdivide(profile, plan.subapertures))).to(image.dtype)
+
+        def blur(one: Given, own: Plan) -> Tensor:
+            return self._blur(one, own, subdivide(profile, own.subapertures))
+
+        out = blur_colours(given, plan, self.lens, blur, margin=self.margin, limit=self.max_coc)
+        return self._cropped(out).to(image.dtype)
+
+    def _blur(self, given: Given, plan: Plan, pieces: Sequence[Profile]) -> Tensor:
+        """The picture ``(B, C, H, W)`` of one light, or of all where they are blurred alike."""
+        image, signed, motion, ends, behind = given
         moves = motion if plan.moves else None
         ends = ends if plan.approaches else None
         if plan.sharp and not signed.requires_grad:
-            return self._cropped(image).clone()
+            return image.clone()
         asked = any(t.requires_grad for t in (signed, *ways(moves)))
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
-            pieces = subdivide(self.aperture.profile(), plan.subapertures)
             merging = plan.quality.merging
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             still = moves is None and ends is None
             moving = partial(moving_picture, image, moves, ends, plan.parts, self.shutter)
             if image.dim() == 5:
-
-                def alpha(k: int) -> Tensor | None:
-                    return None if k in plan.opaque and not image.requires_grad else source[:, k, 3:]
-
+                colour, cover = source[:, :, :-1], source[:, :, -1:]
+                opaque = () if image.requires_grad else plan.opaque
                 surfaces = [
-                    Surface(source[:, k, :3], alpha(k), radii[:, k], bins, moving(k))
+                    Surface(colour[:, k], None if k in opaque else cover[:, k], radii[:, k], bins, moving(k))
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
                 if merging is None or not still:
                     surfaces = [s.continued() for s in surfaces]
-                out = (
-                    torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
-                    if surfaces
-                    else torch.zeros_like(source[:, 0])
-                )
-            elif plan.uniform is not None and not asked:
-                out = self._convolved(source, plan, plan.uniform)
-            elif len(plan.bins) == 2:
-                out = self._over_rest(source, radii, behind, plan, pieces, moving())
-            elif still and len(plan.bins[0]) == 1 and len(pieces) == 1:
-                out = blur_one_layer(source, radii, pieces[0], merging, plan.highest)
-            else:
-                out, _ = compose([Surface(source, None, radii, plan.bins[0], moving())], pieces, merging, plan.highest)
-        return self._cropped(out).to(image.dtype)
+                if not surfaces:
+                    return torch.zeros_like(source[:, 0])
+                return torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
+            if plan.uniform is not None and not asked:
+                return self._convolved(source, plan, plan.uniform)
+            if len(plan.bins) == 2:
+                return self._over_rest(source, radii, behind, plan, pieces, moving())
+            if still and len(plan.bins[0]) == 1 and len(pieces) == 1:
+                return blur_one_layer(source, radii, pieces[0], merging, plan.highest)
+            surface = Surface(source, None, radii, plan.bins[0], moving())
+            return compose([surface], pieces, merging, plan.highest)[0]
 
     def _cropped(self, out: Tensor) -> Tensor:
         height, width = out.shape[-2:]
@@ -258,9 +256,14 @@ class LensBlur(nn.Module):
         return compose(surfaces, pieces, merging, plan.highest)[0]
 
     def _inputs(
-        self, image: Tensor, depth: Tensor | None, coc: Tensor | None, background: Background
-    ) -> tuple[tuple[Tensor, Tensor | None] | None, Tensor, Tensor | None]:
-        """Check everything; return the background with its CoC, the signed CoC, and where ``max_coc`` cut it."""
+        self,
+        image: Tensor,
+        depth: Tensor | None,
+        coc: Tensor | None,
+        moves: tuple[Motion, Tensor | None],
+        background: Background,
+    ) -> tuple[Given, Tensor | None]:
+        """Check everything; return it with its signed CoC, and where ``max_coc`` cut that."""
         layered = isinstance(image, Tensor) and image.dim() == 5
         check_image("image", image, ("B", "L", 4, "H", "W") if layered else ("B", "C", "H", "W"))
         if image.numel() and 2 * self.margin >= min(image.shape[-2:]):
@@ -269,8 +272,20 @@ class LensBlur(nn.Module):
         limit = self.max_coc
         cut = None if limit is None else signed.abs() > limit
         signed = signed if limit is None else signed.clamp(-limit, limit)
+        if self.lens is not None and self.lens.dispersion is not None and image.shape[1] != 3 and not layered:
+            raise ValueError(f"image: expected 3 channels for a lens with dispersion, got {image.shape[1]}")
+        motion, shutter_depth = moves
+        is_coc = coc is not None
+        ends = None
+        if shutter_depth is not None:
+            given = {"is_coc": is_coc, "margin": self.margin, "channels": 2}
+            ends = signed_map(self.lens, image, "shutter_depth", shutter_depth, **given)
+            ends = ends if limit is None else ends.clamp(-limit, limit)
+        check_motion(image, motion)
+        if (motion is not None or ends is not None) and not isinstance(self.aperture, Disc):
+            raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
         if background is None:
-            return None, signed, cut
+            return Given(image, signed, motion, ends, None), cut
         if layered:
             raise ValueError("background: expected None for layers (make it the last layer), got a background")
         pair = background if isinstance(background, tuple) else (background, None)
@@ -279,26 +294,25 @@ class LensBlur(nn.Module):
         colour, behind = pair
         check_image("background", colour, tuple(image.shape), like=image)
         if behind is not None:
-            is_coc = coc is not None
             behind = signed_map(self.lens, image, "background[1]", behind, is_coc=is_coc, margin=self.margin)
             behind = behind if limit is None else behind.clamp(-limit, limit)
-        return (colour, behind), signed, cut
+        return Given(image, signed, motion, ends, (colour, behind)), cut
 
     @staticmethod
-    def _check_plan(plan: Plan, image: Tensor, moves: tuple[Motion, Tensor | None], background: Background) -> None:
+    def _check_plan(plan: Plan, given: Given) -> None:
         if not isinstance(plan, Plan):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
+        image = given.image
         if plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
-        for name, value, asked in zip(
-            ("motion", "shutter_depth"), moves, (plan.motion > STILL[0], plan.approaches), strict=True
-        ):
-            if asked and value is None:
-                raise ValueError(f"plan: expected the {name} it was made with, got none")
+        if plan.motion > STILL[0] and given.motion is None:
+            raise ValueError("plan: expected the motion it was made with, got none")
+        if plan.approaches and given.ends is None:
+            raise ValueError("plan: expected the shutter_depth it was made with, got none")
         count = image.shape[1] if image.dim() == 5 else 0
         if plan.layer_count != count:
             raise ValueError(f"plan: expected one for {count} layers, got one for {plan.layer_count}")
-        if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (background is not None):
+        if plan.hidden in ("filled", "given") and (plan.hidden == "given") != (given.behind is not None):
             raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
 
 

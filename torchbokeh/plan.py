@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
+from torchbokeh.dispersion import Light
 from torchbokeh.ops.convolve import CONVOLVE_FROM
 from torchbokeh.psfs.combined import STILL
 from torchbokeh.quality import Quality
@@ -77,6 +78,8 @@ class Plan(Seen):
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
         predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
+        colours: the lights that a lens with dispersion takes a picture in, one by one; none where that is not seen.
+        spread: how far it spreads them in px, in radius and place.
     """
 
     sharp: bool
@@ -87,6 +90,8 @@ class Plan(Seen):
     quality: Quality
     highest: int
     predicted_error: float
+    colours: tuple["Colour", ...] = ()
+    spread: float = 0.0
 
     @property
     def uniform(self) -> float | None:
@@ -102,7 +107,11 @@ class Plan(Seen):
         height, width = self.size
         low, high = self.coc_range
         head = f"{width} x {height} image, CoC {low:+.1f} to {high:+.1f} px (negative: in front of the focus plane)."
-        if self.sharp:
+        if self.colours:
+            single = all(max(c.light.rgb) == 1 for c in self.colours)
+            how = "red, green and blue" if single else f"{len(self.colours)} bands of the spectrum"
+            head += f"\nDispersion spreads colours by up to {self.spread:.1f} px: {how} are blurred one by one."
+        if self.sharp and not self.colours:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
         if self.uniform is not None:
             moved = f", moved by ({self.pan[0]:.1f}, {self.pan[1]:.1f}) px" if self.moves and self.pan else ""
@@ -135,3 +144,17 @@ class Plan(Seen):
         if self.clamped:
             lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
         return "\n".join(lines)
+
+
+class Colour(NamedTuple):
+    """One light of a picture.
+
+    Attributes:
+        light: its wavelength, and what it adds to each channel.
+        enlarged: whether its picture may have another size.
+        plan: what it needs.
+    """
+
+    light: Light
+    enlarged: bool
+    plan: Plan

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchbokeh.ops.planes import Plates, render_planes
 from torchbokeh.ops.raycast import subsample_blur
+from torchbokeh.prism import Prism
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3, texel_area
 from torchbokeh.views import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
@@ -60,9 +61,19 @@ def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
 
 
 def accumulate_scene(
-    scene: Scene, camera: Camera, views: Views, *, level_of_detail: float, reuse: int, subsamples: int
+    scene: Scene,
+    camera: Camera,
+    views: Views,
+    prism: Prism | None = None,
+    *,
+    level_of_detail: float,
+    reuse: int,
+    subsamples: int,
 ) -> Tensor:
-    """The mean of the views ``(1, 4, H, W)``; see `torchbokeh.AccumulationBuffer`."""
+    """The mean of the views ``(1, 4, H, W)``, or their sum in the colours of a prism.
+
+    See `torchbokeh.AccumulationBuffer` and `torchbokeh.ChromaticAccumulation`.
+    """
     if len(scene) == 0:
         return torch.zeros(1, 4, *camera.size)
     plates = scene.plates() if level_of_detail else scene.plates(levels=1)
@@ -71,14 +82,16 @@ def accumulate_scene(
     level = torch.zeros(count, len(plates.levels), dtype=torch.long)
     if level_of_detail:
         most = torch.tensor([len(p) - 1 for p in plates.levels])
-        level = detail_levels(smallest_radius(seen.low, seen.high), seen.texel, level_of_detail, count, most)
+        below, above = (0.0, 0.0) if prism is None else prism.shifts()
+        radius = smallest_radius(seen.low + below, seen.high + above)
+        level = detail_levels(radius, seen.texel, level_of_detail, count, most)
     offsets, scale = subsample_offsets(views.lens, subsamples)
     views = Views(views.lens * scale, views.time, views.shift)
     parents = None
     if reuse:
         parents = shared_views(views, largest_coc(seen.low, seen.high), seen.motion, reuse, level)
     inverse = inverse3(scene.homographies(camera, views.lens, views.time, views.shift))
-    if not subsamples:
+    if not subsamples and prism is None:
         return render_planes(plates, inverse, level, camera.size, parents=parents)[0]
     sky = scene.backdrop is None or bool(plates.infinite[-1])
     texels = plates.levels[0][0]
@@ -95,6 +108,9 @@ def accumulate_scene(
             shared = (chosen[:, None] == chosen).int().argmax(0)
         frames, nearest = render_planes(plates, own, lod, camera.size, parents=shared, frames=True)
         coc = _coc(camera, nearest.reciprocal())
+        if prism is not None and not subsamples:
+            total = total + prism.moved(frames, coc.to(frames), views, start).sum(0, keepdim=True)
+            continue
         background = None
         if sky:
             background = torch.zeros_like(frames)
@@ -103,8 +119,10 @@ def accumulate_scene(
                 background = render_planes(last, inverse[part, -1:], level[part, -1:], camera.size, frames=True)[0]
         far = float(limit) - 1e-4 if sky else torch.inf  # 1e-4 px from the blur of infinity is infinity
         blurred = subsample_blur(frames, coc, offsets.to(frames.device), far=far, background=background)
+        if prism is not None:
+            blurred = prism.moved(blurred, coc.to(blurred), views, start)
         total = total + blurred.sum(0, keepdim=True)
-    return (total / count).to(texels.dtype)
+    return (total if prism is not None else total / count).to(texels.dtype)
 
 
 @torch.no_grad()
