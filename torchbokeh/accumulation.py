@@ -1,6 +1,7 @@
 """The reference renderer: the mean of many views through the lens while the shutter is open."""
 
 from numbers import Integral, Real
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -126,7 +127,11 @@ class AccumulationBuffer(nn.Module):
             TypeError: an argument of the wrong kind.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        settings = {"level_of_detail": self.level_of_detail, "reuse": self.reuse, "subsamples": self.subsamples}
+        settings: dict[str, Any] = {
+            "level_of_detail": self.level_of_detail,
+            "reuse": self.reuse,
+            "subsamples": self.subsamples,
+        }
         if isinstance(source, Scene):
             if not isinstance(depth, Camera):
                 raise TypeError(f"depth: expected a Camera beside the scene, got {type(depth).__name__}")

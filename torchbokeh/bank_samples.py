@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -87,10 +88,10 @@ def splat_samples(
 
 
 class _Drawn(NamedTuple):
-    """Samples that are to be splatted: each pixel of ``values (B, C, h, w)`` spreads ``index (B, 1, h, w)``."""
+    """Samples that are to be splatted: each pixel of ``values (B, C, h, w)`` spreads ``numbers (B, 1, h, w)``."""
 
     values: Tensor
-    index: Tensor
+    numbers: Tensor
     place: Place
     canvas: Canvas
 
@@ -123,14 +124,14 @@ def _together(drawn: Sequence[_Drawn], bank: PsfBank) -> Tensor:
     (height, width), first = drawn[0].canvas.size, drawn[0].values
     out = first.new_zeros(*first.shape[:2], height, width)
     reach, domains = bank.reach(), bank.domains
-    used = [d.index[:, 0][spreading(d.values)].bincount(minlength=len(bank)) > 0 for d in drawn]
+    used = [d.numbers[:, 0][spreading(d.values)].bincount(minlength=len(bank)) > 0 for d in drawn]
     for number, domain in enumerate(DOMAINS):
         here = [(d, u & (domains == number)) for d, u in zip(drawn, used, strict=True)]
         here = [(d, u) for d, u in here if bool(u.any())]
         if not here:
             continue
         pad = max(math.ceil(float(reach[u].max()) * _stretch(d.place) + _shift(d.place)) + ROOM for d, u in here)
-        buffer = sum(_splat_channels(d, bank, domain, pad) for d, _ in here)
+        buffer = reduce(torch.add, (_splat_channels(d, bank, domain, pad) for d, _ in here))
         out = out + _INTEGRALS[domain](buffer)[..., pad : pad + height, pad : pad + width]
     return out
 
@@ -161,7 +162,7 @@ def _splat_channels(drawn: _Drawn, bank: PsfBank, domain: Domain, pad: int) -> T
             position = torch.stack(torch.meshgrid(columns, rows, indexing="xy"))
         position = place.offset + position
     size = None if canvas.pixels is None else canvas.size
-    frame = {"pad": pad, "rotation": place.frame, "position": position, "size": size}
+    splat = partial(splat_points, pad=pad, rotation=place.frame, position=position, size=size)
     # Channel k of a coloured PSF spreads the channels k, k + 3, ... of the picture.
-    parts = [splat_points(values[:, k::colours], index, bank.table(domain, k), **frame) for k in range(colours)]
+    parts = [splat(values[:, k::colours], index, bank.table(domain, k)) for k in range(colours)]
     return parts[0] if colours == 1 else torch.stack(parts, 2).flatten(1, 2)

@@ -142,7 +142,8 @@ def splat_bank(
     def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
         out = torch.zeros_like(cells)
         alive = spreading(cells)[:, None]
-        moving, discs = [], []
+        moving: list[tuple[Tensor, Labels]] = []
+        discs: list[tuple[Tensor, Tensor]] = []
         for part in now:
             still = None if part.coc is None else bank.model.still(part)
             if still is None or part.coc is None:

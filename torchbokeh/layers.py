@@ -89,7 +89,11 @@ class Moving(NamedTuple):
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Moving":
         """The same with all maps changed."""
-        return self._replace(parts=tuple(Way(*(None if t is None else change(t) for t in way)) for way in self.parts))
+
+        def of(t: Tensor | None) -> Tensor | None:
+            return None if t is None else change(t)
+
+        return self._replace(parts=tuple(Way(change(w.motion), of(w.offset), of(w.coc)) for w in self.parts))
 
     def labels(self, coc: Tensor) -> list[Labels]:
         """What the bank wants to know of a surface of that CoC."""

@@ -34,6 +34,10 @@ class Lens(Held, ABC):
     def depth(self, coc: Tensor, width: int) -> Tensor:
         """Inverse of :meth:`coc`: the depth at which the signed CoC radius is ``coc`` pixels."""
 
+    def coc_shift(self, wavelength: float, width: int, field: Field | None = None) -> Tensor:
+        """How much larger the signed CoC radius of a wavelength is in px: 0 for a lens without dispersion."""
+        return torch.zeros(())
+
     def forward(self, depth: Tensor, width: int) -> Tensor:
         """Same as :meth:`coc`."""
         return self.coc(depth, width)
@@ -213,7 +217,7 @@ class ThinLens(Lens):
             6.36
         """
         if self.dispersion is None:
-            return torch.zeros(())
+            return super().coc_shift(wavelength, width, field)
         gain, _ = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
         parts = gain / self.focal_length, self.dispersion.power(wavelength, field)
         dioptres, power = (t.view(-1, 1, 1, 1) if t.dim() == 1 else t for t in parts)

@@ -136,8 +136,8 @@ class LensBlur(nn.Module):
         plan = decide(look, moves, wishes, background=given.behind is not None)
         if self.lens is None:
             return plan
-        rest = {"margin": self.margin, "limit": self.max_coc}
-        return plan_colours(plan, look, moves, wishes, self.lens, given.signed, **rest)
+        margin, limit = self.margin, self.max_coc
+        return plan_colours(plan, look, moves, wishes, self.lens, given.signed, margin=margin, limit=limit)
 
     def forward(
         self,
@@ -278,8 +278,8 @@ class LensBlur(nn.Module):
         is_coc = coc is not None
         ends = None
         if shutter_depth is not None:
-            given = {"is_coc": is_coc, "margin": self.margin, "channels": 2}
-            ends = signed_map(self.lens, image, "shutter_depth", shutter_depth, **given)
+            signed_ends = partial(signed_map, self.lens, image, "shutter_depth", is_coc=is_coc, channels=2)
+            ends = signed_ends(shutter_depth, margin=self.margin)
             ends = ends if limit is None else ends.clamp(-limit, limit)
         check_motion(image, motion)
         if (motion is not None or ends is not None) and not isinstance(self.aperture, Disc):

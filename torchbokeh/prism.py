@@ -79,5 +79,5 @@ class Prism:
             radius = F.grid_sample(coc, grid[None], mode="nearest", padding_mode="border", align_corners=False)[0]
             # Where the middle of the lens sees what this view shows there.
             pinhole = here - radius * point[:, None, None] - shift[:, None, None]
-            here = goal - self.movement(view, point, Field.of(*pinhole, self.size))
+            here = goal - self.movement(view, point, Field.of(pinhole[0], pinhole[1], self.size))
         return 2 * here.movedim(0, -1) / extent

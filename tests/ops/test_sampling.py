@@ -17,7 +17,7 @@ from torchbokeh.ops.spans import Profile, area, edges_at
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 
 F64 = torch.float64
-BASES = (2, 3, 5, 7, 11)
+BASES = (2, 3, 5, 7, 11, 13)
 SHAPES = {
     "disc": Disc(),
     "ellipse": Ellipse(1.8),

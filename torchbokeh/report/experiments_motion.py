@@ -128,7 +128,8 @@ def _reweighted_bins(image: Tensor, coc: Tensor, motion: Tensor) -> Tensor:
     from torchbokeh.report.capsules import over_reweighted
 
     bank, labels = bank_of_motion(image.device), Labels(coc, motion=motion)
-    rgba, centres = torch.cat([image, torch.ones_like(coc)], 1), bin_centres(*map(float, coc.aminmax()), LKS_LAYERS)
+    low, high = coc.aminmax()
+    rgba, centres = torch.cat([image, torch.ones_like(coc)], 1), bin_centres(float(low), float(high), LKS_LAYERS)
     return over_reweighted([splat_bank(rgba * weight, labels, bank) for weight in bin_weights(coc, centres)])
 
 
