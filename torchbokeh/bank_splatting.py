@@ -11,7 +11,7 @@ from torchbokeh.bank_samples import splat_samples, spreading
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import LEAST_CONTRAST, SPREAD, Merging, merged
+from torchbokeh.ops.merge import LEAST_CONTRAST, SPREAD, Merging, highest_level, merged
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
@@ -164,6 +164,11 @@ def splat_bank(
         return dense + splat(values, parts, 1)
     varies = any(part.coc is not parts[0].coc for part in parts)
     coc = torch.stack([needed(p).abs() for p in parts]).amin(0) if varies else needed(parts[0])
+    # Bins and layers are parts of a picture, and need not have its largest radii.
+    largest = float(torch.where(spreading(values)[:, None], coc.detach().abs(), 0.0).max())
+    highest = min(highest, highest_level(largest, (values.shape[2], values.shape[3]), merging))
+    if highest == 0:
+        return dense + splat(values, parts, 1)
     maps = [torch.cat([packed(p), needed(p).abs()], 1) if varies else packed(p) for p in parts]
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
