@@ -16,6 +16,7 @@ from torch import Tensor
 import torchbokeh
 from torchbokeh.cli_dataset import add_dataset
 from torchbokeh.cli_psfs import add_psfs
+from torchbokeh.dispersion import Dispersion
 from torchbokeh.flow_io import read_flow
 from torchbokeh.image_io import check_writable, read_image, read_map, sample_map, write_image
 from torchbokeh.lens import DisparityLens, ThinLens
@@ -24,7 +25,8 @@ from torchbokeh.quality import QUALITIES
 from torchbokeh.report.command import add_report
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "": 1.0}
-_THIN_LENS_FLAGS = ("focus", "f_number", "focal_length", "sensor_width", "depth_scale")
+_DISPERSION_FLAGS = ("dispersion", "lateral", "glass", "spectrum")
+_THIN_LENS_FLAGS = ("focus", "f_number", "focal_length", "sensor_width", "depth_scale", *_DISPERSION_FLAGS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -95,6 +97,10 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     add("--f-number", type=_positive, metavar="N", help="small is blurry (default 2.8)")
     add("--focal-length", type=_length, metavar="LENGTH", help="default 50mm")
     add("--sensor-width", type=_length, metavar="LENGTH", help="default 36mm")
+    add("--dispersion", type=_finite, metavar="STRENGTH", help="colours focused apart: 1 is a single lens (default 0)")
+    add("--lateral", type=_finite, metavar="STRENGTH", help="colours of unlike size toward the border (default 0)")
+    add("--glass", metavar="NAME", help="what disperses the colours (default BK7)")
+    add("--spectrum", choices=("rgb", "continuous"), help="three wavelengths or all of them (default rgb)")
     add("--strength", type=_positive, metavar="PX", help="blur radius in pixels per unit of disparity")
     add(
         "--aperture",
@@ -153,6 +159,9 @@ def _check_flags(args: argparse.Namespace) -> None:
         if getattr(args, name) is not None:
             flag, kind = name.replace("_", "-"), "--disparity" if args.disparity else "--depth"
             raise ValueError(f"--{flag} has no meaning with {kind}; leave it out (see: torchbokeh render --help)")
+    for name in ("glass", "spectrum"):
+        if getattr(args, name) is not None and args.dispersion is None and args.lateral is None:
+            raise ValueError(f"--{name} has no meaning without --dispersion or --lateral; add one of them")
     if args.disparity and args.strength is None:
         raise ValueError("--disparity needs --strength, the blur radius in pixels per unit of disparity")
 
@@ -196,7 +205,14 @@ def _lens(args: argparse.Namespace, depth: Tensor) -> ThinLens | DisparityLens:
             f"the focus distance {focus:g} m is not beyond the focal length {focal:g} m; "
             "focus farther away, and write millimetres as 50mm"
         )
-    return ThinLens(focal, args.f_number or 2.8, focus, args.sensor_width or 0.036)
+    return ThinLens(focal, args.f_number or 2.8, focus, args.sensor_width or 0.036, dispersion=_dispersion(args))
+
+
+def _dispersion(args: argparse.Namespace) -> Dispersion | None:
+    if args.dispersion is None and args.lateral is None:
+        return None
+    strengths = args.dispersion or 0.0, args.lateral or 0.0
+    return Dispersion(args.glass or "BK7", *strengths, spectrum=args.spectrum or "rgb")
 
 
 def _number(text: str) -> float:

@@ -91,6 +91,25 @@ def test_every_remaining_flag_reaches_the_blur(scene):
     assert_rendered(blur(image, depth) / 2)
 
 
+@pytest.mark.parametrize(
+    ("flags", "dispersion"),
+    [
+        ("--dispersion 0.5", tb.Dispersion("BK7", 0.5)),
+        ("--lateral=-0.2", tb.Dispersion("BK7", 0.0, -0.2)),
+        (
+            "--dispersion 0.3 --lateral 0.1 --glass SF11 --spectrum continuous",
+            tb.Dispersion("SF11", 0.3, 0.1, spectrum="continuous"),
+        ),
+    ],
+)
+def test_dispersion(scene, flags, dispersion):
+    assert render(*THIN, "--f-number", "0.5", *flags.split()) == 0
+    image, depth = tensors()
+    plain = tb.LensBlur(tb.ThinLens(0.05, 0.5, 2.0, 0.036))(image, depth)
+    assert_rendered(tb.LensBlur(tb.ThinLens(0.05, 0.5, 2.0, 0.036, dispersion=dispersion))(image, depth))
+    assert not torch.allclose(read_image("out.tif"), plain, atol=0.01)
+
+
 def test_focus_at_infinity(scene):
     assert main(["render", "image.tif", "--depth", "depth.npy", "--focus", "inf", "-o", "out.png"]) == 0
     assert (scene / "out.png").exists()
@@ -131,6 +150,12 @@ BAD_FLAGS = [
     ("{thin} --aperture blob", "argument --aperture: "),
     ("{thin} --aperture 2-gon", "argument --aperture: "),
     ("{thin} --strength 3", "--strength has no meaning with --depth; leave it out"),
+    ("{thin} --dispersion nan", "argument --dispersion: expected a number, got 'nan'"),
+    ("{thin} --lateral inf", "argument --lateral: expected a finite number, got 'inf'"),
+    ("{thin} --dispersion 1 --glass butter", "glass: expected one of"),
+    ("{thin} --dispersion 1 --spectrum cmyk", "argument --spectrum: invalid choice: 'cmyk'"),
+    ("{thin} --glass BK7", "--glass has no meaning without --dispersion or --lateral"),
+    ("{thin} --spectrum rgb", "--spectrum has no meaning without --dispersion or --lateral"),
     ("{depth} --focus 49mm", "the focus distance 0.049 m is not beyond the focal length 0.05 m"),
     ("{depth} --focus 0", "argument --focus: expected a length above 0"),
     ("{depth} --focus-at 1;1", "argument --focus-at: expected a pixel X,Y such as 320,240, got '1;1'"),
@@ -139,6 +164,10 @@ BAD_FLAGS = [
     ("{disparity} --focus-at 1,1", "--disparity needs --strength"),
     ("{disparity} --strength 3 --focus 2", "--focus has no meaning with --disparity"),
     ("{disparity} --strength 3 --focus-at 1,1 --f-number 2", "--f-number has no meaning with --disparity"),
+    ("{disparity} --strength 3 --focus-at 1,1 --dispersion 1", "--dispersion has no meaning with --disparity"),
+    ("{disparity} --strength 3 --focus-at 1,1 --lateral 0", "--lateral has no meaning with --disparity"),
+    ("{disparity} --strength 3 --focus-at 1,1 --glass BK7", "--glass has no meaning with --disparity"),
+    ("{disparity} --strength 3 --focus-at 1,1 --spectrum rgb", "--spectrum has no meaning with --disparity"),
     ("{disparity} --strength=-3 --focus-at 1,1", "argument --strength: expected a number above 0"),
     ("{disparity} --strength 3 --focus-disparity inf", "argument --focus-disparity: expected a finite number"),
 ]
