@@ -24,7 +24,8 @@ class ChromaticAccumulation(AccumulationBuffer):
     In the mode ``"rgb"`` of `Dispersion` a third of the views go to each of three wavelengths, through the same points
     of the lens: what is grey and in focus stays grey. Without dispersion it is the `AccumulationBuffer`.
 
-    Args, techniques and errors are those of `AccumulationBuffer`. The dispersion is that of ``lens``, or of the lens of
+    Args, techniques and errors are those of `AccumulationBuffer`; sub-samples blur every view by the radii of the
+    reference, and layers share renderings within one wavelength, so not in a continuous spectrum. The dispersion is that of ``lens``, or of the lens of
     the scene's camera.
 
     Raises:
@@ -46,6 +47,11 @@ class ChromaticAccumulation(AccumulationBuffer):
         dispersion = None if lens is None else lens.dispersion
         if lens is None or dispersion is None:
             return super()._spread(lens, size)
+        for name, value in (*lens._values().items(), *dispersion._values().items()):
+            if value.dim():
+                raise ValueError(
+                    f"lens: expected scalar parameters with dispersion, got {name} of shape {tuple(value.shape)}"
+                )
         profile = self.aperture.profile()
         if dispersion.spectrum == "rgb":
             each = Views.spread(max(self.views // 3, 1), profile, first=self.first, seed=self.seed)

@@ -133,7 +133,7 @@ def _enlarged(given: Given, wavelength: float, lens: Lens, field: Field, margin:
     sensor = height - 2 * margin, width - 2 * margin
     here = field
     for _ in range(STEPS):
-        scale = 1 + lens.dispersion.enlargement(wavelength, here).clamp_min(-0.9)
+        scale = 1 + lens.dispersion.enlargement(wavelength, here)
         here = Field.of(field.x / scale, field.y / scale, sensor)
     grid = torch.stack([2 * here.x / width, 2 * here.y / height], -1)
     batch = len(given.image)

@@ -100,8 +100,9 @@ class Dispersion(Held):
         self._hold(axial=axial, lateral=lateral)
         for name, value in self._values().items():
             check_parameter(name, value, value.isfinite(), "a finite strength")
-        shortest = self.relative_focal_length(self.wavelengths()[0])
-        check_parameter("axial", self.axial, shortest > 0, "a strength that leaves focal lengths above 0")
+        for end in self.wavelengths():
+            good = self.relative_focal_length(end) > 0
+            check_parameter("axial", self.axial, good, "a strength that leaves focal lengths above 0")
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
@@ -130,10 +131,10 @@ class Dispersion(Held):
         return focal.clamp_min(0.05).reciprocal() - 1
 
     def enlargement(self, wavelength: float, field: Field) -> Tensor:
-        """``m(λ, t, theta) - 1``: ``(H, W)``, or ``(B, 1, H, W)`` for a batch of strengths."""
+        """``m(λ, t, theta) - 1``, at least -0.9: ``(H, W)``, or ``(B, 1, H, W)`` for a batch of strengths."""
         strength = self.lateral.view(-1, 1, 1, 1) if self.lateral.dim() else self.lateral
         share = torch.ones_like(field.t) if self.lateral_map is None else self.lateral_map(field.t, field.theta)
-        return strength.to(field.t.dtype) * ((self.reference - wavelength) / self.reference) * share
+        return (strength.to(field.t.dtype) * ((self.reference - wavelength) / self.reference) * share).clamp_min(-0.9)
 
     def wavelengths(self) -> tuple[float, float]:
         """The shortest and the longest that are seen, in nanometres."""

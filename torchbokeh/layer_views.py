@@ -94,7 +94,8 @@ def accumulate_layers(
         settings: dict[str, Any] = {"level_of_detail": level_of_detail, "reuse": reuse, "subsamples": subsamples}
         each = zip(layers.split(1), coc.split(1), moved, strict=True)
         return torch.cat([accumulate_layers(*one, views, prism, **settings) for one in each])
-    offsets, scale = subsample_offsets(views.lens, subsamples)
+    points = views.lens if prism is None else views.lens.unique(dim=0)  # wavelengths share points
+    offsets, scale = subsample_offsets(points, subsamples)
     # The pixels of the input are means already: shifting them would only blur them once more.
     views = Views(views.lens * scale, views.time, torch.zeros_like(views.shift))
     with torch.no_grad():

@@ -26,6 +26,10 @@ class Lens(Held, ABC):
 
     dispersion: Dispersion | None
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.dispersion = None
+
     @abstractmethod
     def coc(self, depth: Tensor, width: int) -> Tensor:
         """Signed CoC radius in pixels, positive behind the focus plane; ``width`` is the image's."""
@@ -325,7 +329,6 @@ class DisparityLens(Lens):
 
     def __init__(self, strength: float | Tensor, focus_disparity: float | Tensor) -> None:
         super().__init__()
-        self.dispersion = None
         self._hold(strength=strength, focus_disparity=focus_disparity)
         for name, value in self._values().items():
             check_parameter(name, value, value.isfinite(), "a finite value")

@@ -85,7 +85,8 @@ def accumulate_scene(
         below, above = (0.0, 0.0) if prism is None else prism.shifts()
         radius = smallest_radius(seen.low + below, seen.high + above)
         level = detail_levels(radius, seen.texel, level_of_detail, count, most)
-    offsets, scale = subsample_offsets(views.lens, subsamples)
+    points = views.lens if prism is None else views.lens.unique(dim=0)  # wavelengths share points
+    offsets, scale = subsample_offsets(points, subsamples)
     views = Views(views.lens * scale, views.time, views.shift)
     parents = None
     if reuse:
