@@ -25,8 +25,8 @@ class ChromaticAccumulation(AccumulationBuffer):
     of the lens: what is grey and in focus stays grey. Without dispersion it is the `AccumulationBuffer`.
 
     Args, techniques and errors are those of `AccumulationBuffer`; sub-samples blur every view by the radii of the
-    reference, and layers share renderings within one wavelength, so not in a continuous spectrum. The dispersion is that of ``lens``, or of the lens of
-    the scene's camera.
+    reference, and layers share renderings within one wavelength, so not in a continuous spectrum. The dispersion is
+    that of ``lens``, or of the lens of the scene's camera.
 
     Raises:
         TypeError: an argument of the wrong kind.
