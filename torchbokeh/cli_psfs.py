@@ -79,7 +79,7 @@ def _show(args: argparse.Namespace) -> None:
 def _table(args: argparse.Namespace) -> None:
     from torchbokeh.psfs.bank import PsfBank, installed
     from torchbokeh.psfs.table import LKS, held_out, sparsity
-    from torchbokeh.report.tables import table
+    from torchbokeh.report.markdown import table
 
     rows = []
     for source in args.banks or installed():

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchbokeh.image_io import replacing
 from torchbokeh.psf_analysis import METHODS, SHARES, SPARSITY
-from torchbokeh.report.tables import table
+from torchbokeh.report.markdown import table
 
 Row = dict[str, Any]
 

@@ -68,6 +68,8 @@ def draw(found: dict[str, Any]) -> dict[str, Figure]:
         figures["layers.png"] = _layers(rows["layers"])
     if rows["threads"]:
         figures["threads.png"] = _threads(rows["threads"])
+    if rows["chromatic_truth"]:
+        figures["chromatic.png"] = _chromatic(rows["chromatic_truth"])
     return figures
 
 
@@ -321,6 +323,32 @@ def _threads(rows: list[Row]) -> Figure:
     slowest = max(row["seconds"] for row in rows if row["threads"] == 1)
     axes.plot([1, most], [slowest, slowest / most], color="0.6", linestyle=":", label="in proportion")
     figure.legend(loc="outside right upper", frameon=False, fontsize=9)
+    return figure
+
+
+def _chromatic(rows: list[Row]) -> Figure:
+    """Error against the truth by time with dispersion, the mean over all cases of each method and setting."""
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    axes = figure.subplots()
+    labels = []
+    names = dict.fromkeys(row["method"] for row in rows if row["method"] != "truth")
+    for name, colour in zip(names, ("#9467bd", "#d62728", "#1f77b4"), strict=True):
+        points = []
+        for setting in dict.fromkeys(row["setting"] for row in rows if row["method"] == name):
+            of = [row for row in rows if (row["method"], row["setting"]) == (name, setting)]
+            points.append((_mean([row["seconds"] for row in of]), _mean([1 - row["ssim"] for row in of])))
+            labels.append(_Label(*points[-1], setting, colour, (0, 1)))
+        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=name, markersize=6)
+    noise = _mean([1 - row["ssim"] for row in rows if row["method"] == "truth"])
+    axes.axhline(noise, color="0.6", linestyle="--", label="between two truths")
+    axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="1 - SSIM against the truth")
+    axes.set_title("With dispersion, mean over scenes, spectra and strengths")
+    axes.margins(0.15)
+    _plain_seconds(axes)
+    _plain_errors(axes)
+    axes.grid(alpha=0.25, which="both")
+    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
+    _write_labels(figure, axes, labels)
     return figure
 
 

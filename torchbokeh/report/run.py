@@ -13,6 +13,7 @@ from torchbokeh.report.experiments import (
     one_layer,
 )
 from torchbokeh.report.experiments_blur import against_layers, against_truth, left_out
+from torchbokeh.report.experiments_chromatic import chromatic_bands, chromatic_samples, chromatic_truth, importance
 from torchbokeh.report.experiments_motion import like_lks, with_motion
 from torchbokeh.report.experiments_stages import stages
 from torchbokeh.report.machine import machine
@@ -32,6 +33,10 @@ EXPERIMENTS = {
     "threads": against_threads,
     "motion": with_motion,
     "like_lks": like_lks,
+    "chromatic_truth": chromatic_truth,
+    "chromatic_samples": chromatic_samples,
+    "chromatic_bands": chromatic_bands,
+    "importance": importance,
     "left_out": left_out,
     "stages": stages,
 }

@@ -33,6 +33,16 @@ class Settings:
         layer_counts: of run time against layers.
         motion_size: of defocus with motion.
         motions: of that, pairs of largest radius and longest motion in px.
+        chromatic_scenes: recipes of the experiments on dispersion.
+        chromatic_strengths: of these, pairs of axial and lateral.
+        chromatic_size: likewise.
+        chromatic_radius: likewise.
+        chromatic_truth: views of their truth.
+        chromatic_views: of the accumulation that is compared with it.
+        chromatic_repeat: timed runs of each method.
+        sample_views: of run time against views with dispersion.
+        band_views: of the dot whose bands of colour are measured.
+        importance_seeds: of the variance with importance sampling of a spectrum.
     """
 
     scenes: tuple[str, ...] = NAMES
@@ -57,6 +67,16 @@ class Settings:
     layer_counts: tuple[int, ...] = (1, 2, 4, 8, 16)
     motion_size: int = 1024
     motions: tuple[tuple[float, float], ...] = ((25.0, 40.0), (60.0, 120.0))
+    chromatic_scenes: tuple[str, ...] = ("coins", "ramp")
+    chromatic_strengths: tuple[tuple[float, float], ...] = ((0.5, 0.0), (0.0, 0.03), (0.5, 0.03))
+    chromatic_size: int = 256
+    chromatic_radius: float = 13.0
+    chromatic_truth: int = 4096
+    chromatic_views: tuple[int, ...] = (64, 256, 1024)
+    chromatic_repeat: int = 2
+    sample_views: tuple[int, ...] = (16, 64, 256, 1024)
+    band_views: int = 510
+    importance_seeds: int = 16
 
     def row(self) -> dict[str, Any]:
         """Everything, for the record."""
@@ -88,4 +108,13 @@ def quick(scenes: tuple[str, ...] = NAMES) -> Settings:
         layer_counts=(1, 4),
         motion_size=64,
         motions=((6.0, 12.0),),
+        chromatic_scenes=("coins",),
+        chromatic_strengths=((0.5, 0.03),),
+        chromatic_size=48,
+        chromatic_radius=5.0,
+        chromatic_truth=32,
+        chromatic_views=(6, 16),
+        chromatic_repeat=1,
+        sample_views=(6, 12, 24),
+        band_views=96,
     )

@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-Row = dict[str, Any]
+from torchbokeh.report.markdown import Row, number, pictures, seconds, section, spread, table
+from torchbokeh.report.tables_chromatic import chromatic_sections
 
 
 def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
@@ -27,43 +28,12 @@ def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
         _threads(rows["threads"], settings, plots),
         _motion(rows["motion"]),
         _like_lks(rows["like_lks"], settings),
+        *chromatic_sections(rows, settings, plots),
         _left_out(rows["left_out"], settings),
         _stages(rows["stages"]),
         _methods(found["methods"], found["absent"]),
     ]
     return "\n\n".join(section for section in sections if section) + "\n"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-def seconds(value: float) -> str:
-    """Three digits that count, without an exponent.
-
-    Example:
-        >>> seconds(0.0123456), seconds(12.3456)
-        ('0.0123', '12.3')
-    """
-    return f"{value:.1f}" if value >= 10 else f"{value:.2f}" if value >= 1 else f"{value:#.3g}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
-def _spread(row: Row) -> str:
-    return f"{seconds(row['quartile_low'])} - {seconds(row['quartile_high'])}"
-
-
-def _pictures(plots: Sequence[str], start: str) -> list[str]:
-    return [f"![{name.removesuffix('.png').replace('_', ' ')}]({name})" for name in plots if name.startswith(start)]
-
-
-def _section(title: str, *parts: str) -> str:
-    return "\n\n".join([f"## {title}", *(part for part in parts if part)])
 
 
 def _head(found: dict[str, Any]) -> str:
@@ -99,14 +69,14 @@ def _one_layer(rows: list[Row], plots: Sequence[str]) -> str:
     for radius in dict.fromkeys(row["radius"] for row in rows if row["scene"] == "photo"):
         chosen = [row for row in rows if row["scene"] == "photo" and row["radius"] == radius]
         parts.append(f"### photo, {chosen[0]['size']} x {chosen[0]['size']}, radius up to {radius:g} px")
-        parts += [*_pictures(plots, f"one_layer_{radius:g}"), _error_table(chosen), _skipped(chosen)]
+        parts += [*pictures(plots, f"one_layer_{radius:g}"), _error_table(chosen), _skipped(chosen)]
     recipes = [row for row in rows if row["scene"] != "photo"]
     if recipes:
         parts.append(
             f"### recipes, {recipes[0]['size']} x {recipes[0]['size']}, radius up to {recipes[0]['radius']:g} px"
         )
-        parts += [*_pictures(plots, "one_layer_recipes"), "SSIM (seconds)", _recipe_table(recipes)]
-    return _section("Error against run time", *parts)
+        parts += [*pictures(plots, "one_layer_recipes"), "SSIM (seconds)", _recipe_table(recipes)]
+    return section("Error against run time", *parts)
 
 
 def _error_table(rows: list[Row]) -> str:
@@ -116,8 +86,8 @@ def _error_table(rows: list[Row]) -> str:
         header,
         (
             (
-                *(row["method"], seconds(row["seconds"]), _spread(row), str(row["runs"]), f"{row['ssim']:.5f}"),
-                *(_number(row["psnr"], ".1f"), f"{row['l1']:.2g}", _number(row["flip"], ".4f"), "*" * row["pareto"]),
+                *(row["method"], seconds(row["seconds"]), spread(row), str(row["runs"]), f"{row['ssim']:.5f}"),
+                *(number(row["psnr"], ".1f"), f"{row['l1']:.2g}", number(row["flip"], ".4f"), "*" * row["pareto"]),
             )
             for row in run
         ),
@@ -155,7 +125,7 @@ def _truth(rows: list[Row], plots: Sequence[str]) -> str:
     of = {(row["scene"], row["input"], row["quality"]): row for row in rows}
 
     def to_truth(row: Row) -> str:
-        return f"{row['ssim_truth']:.4f} / {_number(row['psnr_truth'], '.1f')}"
+        return f"{row['ssim_truth']:.4f} / {number(row['psnr_truth'], '.1f')}"
 
     def to_exact(row: Row) -> str:
         return f"{row['ssim_exact']:.4f} ({seconds(row['seconds'])}, {row['times_one_layer']:.1f})"
@@ -167,13 +137,13 @@ def _truth(rows: list[Row], plots: Sequence[str]) -> str:
             ([", ".join(kind), *map(form, each), form(_mean(each))] for kind, each in found),
         )
 
-    return _section(
+    return section(
         "LensBlur against the truth",
         "The truth is the mean of many pinhole pictures through the lens, with the shutter open for no time. Its two "
         "independent halves agree as the first row says; the truth is their mean. A border as wide as the largest "
         "radius is left out. *One layer* is KernelSplatting, the other inputs are those of LensBlur: an image with its "
         "CoC, the same with what the foreground really hides, and all layers.",
-        *_pictures(plots, "truth"),
+        *pictures(plots, "truth"),
         "SSIM / PSNR against the truth:",
         lines(kinds, to_truth),
         "SSIM against the exact quality (seconds, and how many times those of one layer at the same quality):",
@@ -204,10 +174,10 @@ def _by_method(rows: list[Row], column: str, form: Callable[[Row], str]) -> str:
 def _radius(rows: list[Row], plots: Sequence[str]) -> str:
     if not rows:
         return ""
-    return _section(
+    return section(
         "Run time against radius",
         f"photo, {rows[0]['size']} x {rows[0]['size']}; columns: largest radius in px. Seconds (SSIM):",
-        *_pictures(plots, "radius"),
+        *pictures(plots, "radius"),
         _by_method(rows, "radius", lambda row: f"{seconds(row['seconds'])} ({row['ssim']:.4f})"),
         _skipped([{**row, "where": f"{row['radius']:g} px"} for row in rows]),
     )
@@ -218,7 +188,7 @@ def _pixels(rows: list[Row], plots: Sequence[str]) -> str:
         return ""
     parts = [
         f"photo, radius up to {rows[0]['radius']:g} px; columns: megapixels (10^6). Seconds:",
-        *_pictures(plots, "pixels"),
+        *pictures(plots, "pixels"),
         _by_method(rows, "megapixels", lambda row: seconds(row["seconds"])),
     ]
     if any(row.get("peak_bytes") for row in rows):
@@ -227,7 +197,7 @@ def _pixels(rows: list[Row], plots: Sequence[str]) -> str:
             "highest resident memory during the call less that before it.",
             _by_method([row for row in rows if row.get("peak_bytes")], "megapixels", _megabytes),
         ]
-    return _section("Run time and memory against pixels", *parts, _skipped(rows))
+    return section("Run time and memory against pixels", *parts, _skipped(rows))
 
 
 def _megabytes(row: Row) -> str:
@@ -240,10 +210,10 @@ def _layers(rows: list[Row], plots: Sequence[str]) -> str:
     counts = list(dict.fromkeys(row["layers"] for row in rows))
     of = {(row["kind"], row["layers"]): row for row in rows}
     kinds = dict.fromkeys(row["kind"] for row in rows)
-    return _section(
+    return section(
         "Run time against layers",
         f"photo, {rows[0]['size']} x {rows[0]['size']}, radius up to {rows[0]['radius']:g} px; seconds of LensBlur:",
-        *_pictures(plots, "layers"),
+        *pictures(plots, "layers"),
         table(
             ["", *map(str, counts)],
             ([kind, *(seconds(of[kind, count]["seconds"]) for count in counts)] for kind in kinds),
@@ -256,11 +226,11 @@ def _threads(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
         return ""
     same = all(row["same_bits"] for row in rows)
     differ = dict.fromkeys(row["method"] for row in rows if not row["same_bits"])
-    return _section(
+    return section(
         "Run time against threads",
         f"photo, {settings['photo_size']} x {settings['photo_size']}, radius up to {settings['sweep_radius']:g} px; "
         "columns: threads. Seconds:",
-        *_pictures(plots, "threads"),
+        *pictures(plots, "threads"),
         _by_method(rows, "threads", lambda row: seconds(row["seconds"])),
         "The bits are those of one thread, always."
         if same
@@ -274,20 +244,20 @@ def _motion(rows: list[Row]) -> str:
     size = f"{rows[0]['size']} x {rows[0]['size']}"
     cells = []
     for row in rows:
-        errors = [_number(row["ssim"], ".4f"), _number(row["psnr"], ".1f"), _number(row["l1"], ".4f")]
+        errors = [number(row["ssim"], ".4f"), number(row["psnr"], ".1f"), number(row["l1"], ".4f")]
         what = [f"{row['radius']:g}", f"{row['longest']:g}", row["method"]]
         cells.append([*what, seconds(row["seconds"]), f"{row['times_dense']:.1f}", *errors])
     head = ["radius", "motion", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
     about = f"photo, {size}, turning; up to so many px of radius and motion; errors against the dense scatter."
-    return _section("Defocus with motion", about, table(head, cells))
+    return section("Defocus with motion", about, table(head, cells))
 
 
 def like_lks_table(rows: list[Row]) -> str:
     """The rows of `torchbokeh.report.experiments_motion.like_lks` as a Markdown table."""
     head = ["scene", "kind", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
     cells = [
-        [row["scene"], row["kind"], row["method"], seconds(row["seconds"]), _number(row["times_dense"], ".1f")]
-        + [_number(row[key], form) for key, form in (("ssim", ".4f"), ("psnr", ".1f"), ("l1", ".4f"))]
+        [row["scene"], row["kind"], row["method"], seconds(row["seconds"]), number(row["times_dense"], ".1f")]
+        + [number(row[key], form) for key, form in (("ssim", ".4f"), ("psnr", ".1f"), ("l1", ".4f"))]
         for row in rows
     ]
     return table(head, cells)
@@ -305,7 +275,7 @@ def _like_lks(rows: list[Row], settings: Row) -> str:
         "another, as LKS composes them after Lee et al. (2008). The time of non-local means is that of five "
         "strengths, of which the best one counts."
     )
-    return _section("Synthesis and reconstruction", about, like_lks_table(rows))
+    return section("Synthesis and reconstruction", about, like_lks_table(rows))
 
 
 def _left_out(rows: list[Row], settings: Row) -> str:
@@ -316,7 +286,7 @@ def _left_out(rows: list[Row], settings: Row) -> str:
         return "; ".join(f"{name} {seconds(value)} s" for name, value in row["beside"].items())
 
     size = settings["photo_size"]
-    return _section(
+    return section(
         "What a plan leaves out",
         f"{size} x {size}, radius up to {settings['sweep_radius']:g} px. Seconds of LensBlur with its plan, their "
         "share of those of the full scene, and seconds of the one-layer splat of the same picture.",
@@ -338,7 +308,7 @@ def _stages(rows: list[Row]) -> str:
     if not rows:
         return ""
     header = ["quality", "radius", "stage", "seconds", "share", "least seconds"]
-    return _section(
+    return section(
         "Share of each stage",
         table(
             header,
@@ -357,4 +327,4 @@ def _stages(rows: list[Row]) -> str:
 def _methods(methods: list[Row], absent: list[str]) -> str:
     missing = "Not measured here:\n\n" + "\n".join(f"- {line}" for line in absent) if absent else ""
     rows = ([row["name"], row["description"]] for row in methods)
-    return _section("What the methods are", table(["method", "what it does"], rows), missing)
+    return section("What the methods are", table(["method", "what it does"], rows), missing)

@@ -25,6 +25,15 @@ TINY = Settings(
     layer_counts=(1, 3),
     motion_size=48,
     motions=((6.0, 10.0),),
+    chromatic_scenes=("coins",),
+    chromatic_strengths=((0.5, 0.03),),
+    chromatic_size=40,
+    chromatic_radius=3.0,
+    chromatic_truth=32,
+    chromatic_views=(6, 12),
+    chromatic_repeat=1,
+    sample_views=(6, 12, 24),
+    band_views=150,
 )
 
 

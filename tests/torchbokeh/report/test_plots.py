@@ -19,6 +19,7 @@ def test_there_is_a_plot_for_every_experiment(report):
         "pixels.png",
         "layers.png",
         "threads.png",
+        "chromatic.png",
     ]
 
 

@@ -2,7 +2,8 @@ import re
 
 import pytest
 
-from torchbokeh.report.tables import markdown, seconds, table
+from torchbokeh.report.markdown import seconds, table
+from torchbokeh.report.tables import markdown
 
 
 def test_a_table_is_markdown():
@@ -28,6 +29,10 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Run time against threads",
         "Defocus with motion",
         "Synthesis and reconstruction",
+        "Dispersion against the truth",
+        "Dispersion: run time against views",
+        "Dispersion: bands of colour",
+        "Dispersion: importance sampling",
         "What a plan leaves out",
         "What the methods are",
     ]
