@@ -27,7 +27,7 @@ def _truth(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
     size = settings["chromatic_size"]
     about = (
         f"{size} x {size}, radius up to {settings['chromatic_radius']:g} px, BK7. The truth is ChromaticAccumulation "
-        f"of {settings['chromatic_truth']} views; the row *truth* compares its two halves, whose noise is twice that of "
+        f"of {settings['chromatic_truth']} views; the row *truth* compares its two halves, which have more noise than "
         "their mean. A border as wide as the largest radius, the spread of colours and 2 px is left out. *Times equal* "
         "is how many times longer the accumulation takes to come as near by SSIM; > where it does not with the views "
         "tried: then that is the ratio to the most views; < where it does so with the fewest. Medians of up to "
