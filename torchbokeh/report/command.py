@@ -22,7 +22,7 @@ def add_report(parser: argparse.ArgumentParser) -> None:
     """
     parser.description = (
         "Measures error and run time of every operating point, beside well-known ways to blur, and writes report.md, "
-        "report.json and plots. Takes about a quarter of an hour on two processors; leave the machine alone meanwhile."
+        "report.json and plots. Takes about half an hour on two processors; leave the machine alone meanwhile."
     )
     add = parser.add_argument
     add("--scenes", type=_names, metavar="A,B", help="scenes to measure errors on (default: all)")
