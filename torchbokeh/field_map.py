@@ -1,6 +1,7 @@
 """Maps over the picture: how strong an effect is at each angle of view, as a composition of two simple functions."""
 
 import math
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -78,15 +79,16 @@ def _angular(t: Tensor, theta: Tensor) -> Tensor:
 
 
 _ATOMS: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], str]] = {
-    "identity": (_identity, "{}"),
-    "square": (_square, "({})**2"),
-    "cube": (_cube, "({})**3"),
-    "exp": (_exp, "exp({})"),
-    "inversion": (_inversion, "(1 - {})"),
-    "reciprocal": (_reciprocal, "1 / ({})"),
-    "cosine": (_cosine, "cos(2 pi {})"),
-    "angular": (_angular, "({}) cos(theta)"),
+    "identity": (_identity, "{0}"),
+    "square": (_square, "{1}**2"),
+    "cube": (_cube, "{1}**3"),
+    "exp": (_exp, "exp({0})"),
+    "inversion": (_inversion, "1 - {1}"),
+    "reciprocal": (_reciprocal, "1 / {1}"),
+    "cosine": (_cosine, "cos(2 pi {1})"),
+    "angular": (_angular, "{1} cos(theta)"),
 }
+"""Each function, and its formula: {0} is its argument, {1} that in brackets where it needs them."""
 
 Atom = str | Callable[[Tensor, Tensor], Tensor]
 
@@ -109,7 +111,7 @@ class FieldMap:
 
     Example:
         >>> FieldMap("inversion", "exp")
-        FieldMap(exp((1 - t)))
+        FieldMap(exp(1 - t))
         >>> FieldMap("inversion", "reciprocal")(torch.tensor([0.0, 0.5, 1.0]), torch.zeros(3)).tolist()
         [1.0, 2.0, 20.0]
     """
@@ -133,7 +135,8 @@ class FieldMap:
         text = "t"
         for atom in (self.pre, self.post):
             if isinstance(atom, str):
-                text = _ATOMS[atom][1].format(text)
+                simple = text.isidentifier() or re.fullmatch(r"\w+\([^()]*\)", text)
+                text = _ATOMS[atom][1].format(text, text if simple else f"({text})")
             else:
                 text = f"{getattr(atom, '__name__', type(atom).__name__)}({text}, theta)"
         return f"FieldMap({text})"
