@@ -12,6 +12,7 @@ given.
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -177,9 +178,10 @@ def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
 
     Args:
         b: Laplacian of an image, shape (B, C, H, W), any size.
-        h1: analysis kernel, symmetric, shape (5,).
-        h2: synthesis kernel, symmetric, shape (5,). Swapping it with ``h1`` gives the transposed operator.
-        g: kernel of each level, symmetric, shape (3,).
+        h1: analysis kernel, symmetric, shape (5,), that acts along both axes on every level; or ``(L, 5, 5)``, those of
+            the L finest levels, of which the last stands for all that are coarser.
+        h2: synthesis kernel, alike. Swapping it with ``h1`` gives the transposed operator.
+        g: kernel of each level, symmetric, shape (3,), (L, 3, 3) or (L, 5, 5).
 
     Returns:
         Image of shape (B, C, H, W), in the dtype of ``b``.
@@ -197,26 +199,35 @@ def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
     """
     check_image("b", b, _SHAPE)
     for name, kernel, taps in (("h1", h1, 5), ("h2", h2, 5), ("g", g, 3)):
-        check_image(name, kernel, (taps,), like=b)
+        levels = isinstance(kernel, Tensor) and kernel.dim() == 3
+        taps = 5 if levels and kernel.shape[-1] == 5 else taps
+        check_image(name, kernel, ("L", taps, taps) if levels else (taps,), like=b)
+        if len(kernel) == 0:
+            raise ValueError(f"{name}: expected kernels of at least one level, got shape {tuple(kernel.shape)}")
     channels = b.shape[0] * b.shape[1]
     dtype = torch.promote_types(b.dtype, torch.float32)
 
-    def per_channel(kernel: Tensor) -> Tensor:
-        square = torch.outer(kernel.to(dtype), kernel.to(dtype))
-        return square.expand(channels, 1, *square.shape)
+    def per_level(kernel: Tensor) -> Callable[[int], Tensor]:
+        square = kernel.to(dtype) if kernel.dim() == 3 else torch.outer(kernel.to(dtype), kernel.to(dtype))[None]
+        return lambda level: square[min(level, len(square) - 1)].expand(channels, 1, *square.shape[1:])
 
-    analysis, synthesis, level = per_channel(h1), per_channel(h2), -per_channel(g)
+    analysis, synthesis, own = per_level(h1), per_level(h2), per_level(g)
+
+    def filtered(x: Tensor, level: int) -> Tensor:
+        return F.conv2d(x, -own(level), padding=g.shape[-1] // 2, groups=channels)
+
     a = [b.reshape(1, channels, *b.shape[-2:]).to(dtype)]
     # One level more than it takes to shrink the longer side to one pixel: the ones above change little.
-    for _ in range((max(b.shape[-2:]) - 1).bit_length() + 1):
+    count = (max(b.shape[-2:]) - 1).bit_length() + 1
+    for level in range(count):
         # A padding of 4 keeps every coarse sample that a kernel of radius 2 reaches: even positions from -2 on.
-        a.append(F.conv2d(a[-1], analysis, stride=2, padding=4, groups=channels))
-    u = F.conv2d(a.pop(), level, padding=1, groups=channels)
+        a.append(F.conv2d(a[-1], analysis(level), stride=2, padding=4, groups=channels))
+    u = filtered(a.pop(), count)
     while a:
         fine = a.pop()
         odd = (1 - fine.shape[-2] % 2, 1 - fine.shape[-1] % 2)
-        u = F.conv_transpose2d(u, synthesis, stride=2, padding=4, output_padding=odd, groups=channels)
-        u = u + F.conv2d(fine, level, padding=1, groups=channels)
+        u = F.conv_transpose2d(u, synthesis(len(a)), stride=2, padding=4, output_padding=odd, groups=channels)
+        u = u + filtered(fine, len(a))
     return u.reshape(b.shape).to(b.dtype)
 
 

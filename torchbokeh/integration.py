@@ -1,5 +1,7 @@
 """Modules that undo the differential operator of a domain (LKS sections 4 and 6.3)."""
 
+from pathlib import Path
+
 import torch
 from torch import Tensor, nn
 
@@ -7,6 +9,9 @@ from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.integrate import difference_x, laplacian, poisson_fft, poisson_pyramid, running_sum_x
 
 _SHAPE = ("B", "C", "H", "W")
+
+TRAINED = Path(__file__).parent / "weights" / "pyramid.safetensors"
+"""Kernels of `PyramidIntegrator`, made by ``python examples/train_integrator.py``."""
 
 
 class Integrator(nn.Module):
@@ -116,14 +121,22 @@ class FFTIntegrator(Integrator):
 class PyramidIntegrator(Integrator):
     """5-point Laplacian and a convolution pyramid: approximate, convolutions only, time linear in the pixels.
 
-    The kernels are parameters, symmetric by construction: only the centre and one side are stored. They start at
-    the values of Farbman et al. 2011, "Convolution Pyramids"; `torchbokeh.ops.integrate.poisson_pyramid` tells
-    their error.
+    The kernels are parameters, with the symmetry of the square by construction: only one eighth of each is stored. By
+    default they are trained ones, of their own on the finest levels and one set for all coarser ones;
+    `torchbokeh.training` trains them. It runs at any size.
+
+    Args:
+        weights: ``"trained"``, which come with the package, or ``"published"``: those of Farbman et al. 2011,
+            "Convolution Pyramids", the same on every level; `torchbokeh.ops.integrate.poisson_pyramid` tells their
+            error.
 
     Attributes:
-        h1: analysis kernel, taps at 0, ±1, ±2, shape (3,).
-        h2: synthesis kernel, taps at 0, ±1, ±2, shape (3,).
-        g: kernel of each level, taps at 0, ±1, shape (2,).
+        h1: analysis kernels of 5 x 5, ``(L, 6)``: at (0, 0), (0, 1), (1, 1), (0, 2), (1, 2) and (2, 2).
+        h2: synthesis kernels, likewise.
+        g: kernels of each level of 5 x 5, likewise; the published ones of 3 x 3, ``(1, 3)``.
+
+    Raises:
+        ValueError: other weights.
 
     Example:
         >>> pyramid = PyramidIntegrator()
@@ -133,12 +146,41 @@ class PyramidIntegrator(Integrator):
         True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, weights: str = "trained") -> None:
         super().__init__()
-        self.h1 = nn.Parameter(torch.tensor([0.7, 0.5, 0.15]))
-        self.h2 = nn.Parameter(torch.tensor([0.7, 0.5, 0.15]))
-        self.g = nn.Parameter(torch.tensor([0.547, 0.175]))
+        if weights not in ("trained", "published"):
+            raise ValueError(f"weights: expected 'trained' or 'published', got {weights!r}")
+        self.weights = weights
+        h, g = torch.tensor([0.7, 0.5, 0.15]), torch.tensor([0.547, 0.175])
+        eighths = {"h1": _eighth(h), "h2": _eighth(h), "g": _eighth(g)}
+        if weights == "trained":
+            from safetensors.torch import load_file
+
+            eighths = load_file(TRAINED)
+        self.h1, self.h2, self.g = (nn.Parameter(eighths[name]) for name in ("h1", "h2", "g"))
+
+    def extra_repr(self) -> str:
+        """Show the configuration in ``repr``."""
+        return f"weights={self.weights!r}, levels={len(self.h1)}"
 
     def _integrate(self, buffer: Tensor) -> Tensor:
-        h1, h2, g = (torch.cat((side[1:].flip(0), side)) for side in (self.h1, self.h2, self.g))
-        return poisson_pyramid(buffer, h1, h2, g)
+        return poisson_pyramid(buffer, *(_whole(kernel) for kernel in (self.h1, self.h2, self.g)))
+
+
+def _places(reach: int) -> list[tuple[int, int]]:
+    """Of an eighth of a kernel: (0, 0), (0, 1), (1, 1), (0, 2), ..."""
+    return [(y, x) for x in range(reach + 1) for y in range(x + 1)]
+
+
+def _eighth(side: Tensor) -> Tensor:
+    """Of the kernel that is a product of its taps 0, 1, ... along both axes: ``(1, N)``."""
+    return torch.stack([side[y] * side[x] for y, x in _places(len(side) - 1)])[None]
+
+
+def _whole(eighth: Tensor) -> Tensor:
+    """``(L, N) -> (L, n, n)``."""
+    reach = {3: 1, 6: 2}[eighth.shape[1]]
+    numbers = {place: k for k, place in enumerate(_places(reach))}
+    span = [abs(k) for k in range(-reach, reach + 1)]
+    index = [[numbers[min(y, x), max(y, x)] for x in span] for y in span]
+    return eighth[:, torch.tensor(index, device=eighth.device)]

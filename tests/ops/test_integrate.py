@@ -271,6 +271,27 @@ def test_swapping_the_kernels_transposes_the_pyramid(size: tuple[int, ...], seed
     torch.testing.assert_close(left, right, atol=1e-9, rtol=1e-9)
 
 
+def test_kernels_of_every_level() -> None:
+    b = random(1, 2, 21, 18)
+    squares = [torch.outer(k, k)[None] for k in OTHER]
+    torch.testing.assert_close(poisson_pyramid(b, *squares), pyramid(b, OTHER))
+    torch.testing.assert_close(poisson_pyramid(b, *(k.expand(3, -1, -1) for k in squares)), pyramid(b, OTHER))
+    wide = F.pad(squares[2], (1, 1, 1, 1))
+    torch.testing.assert_close(poisson_pyramid(b, *squares[:2], wide), pyramid(b, OTHER))
+    # Those of the finest level alone: what is beyond it has the same kernels as before.
+    fine = [torch.cat([2 * k, k]) for k in squares]
+    coarse = F.conv2d(b.movedim(1, 0), 2 * squares[0][None], stride=2, padding=4)
+    up = F.conv_transpose2d(
+        poisson_pyramid(coarse, *OTHER), 2 * squares[1][None], stride=2, padding=4, output_padding=(0, 1)
+    )
+    want = up - F.conv2d(b.movedim(1, 0), 2 * squares[2][None], padding=1)
+    torch.testing.assert_close(poisson_pyramid(b, *fine), want.movedim(0, 1), rtol=1e-6, atol=1e-3)
+    with pytest.raises(ValueError, match=r"h1: expected shape \(L, 5, 5\), got \(1, 4, 4\)"):
+        poisson_pyramid(b, torch.zeros(1, 4, 4, dtype=F64), *squares[1:])
+    with pytest.raises(ValueError, match="h2: expected kernels of at least one level"):
+        poisson_pyramid(b, squares[0], squares[1][:0], squares[2])
+
+
 # --- what holds for every operator -----------------------------------------------------------------------------
 
 

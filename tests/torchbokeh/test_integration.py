@@ -9,16 +9,34 @@ from torch import Tensor
 import torchbokeh.integration
 from torchbokeh.integration import FFTIntegrator, Integrator, PyramidIntegrator, ScanlineIntegrator
 from torchbokeh.ops.integrate import difference_x, laplacian, poisson_fft, poisson_pyramid, running_sum_x
+from torchbokeh.training import KINDS, laplacian_pictures, relative_errors
 
 F64 = torch.float64
 
 
+BETTER = {"discs": 0.9, "noise": 0.5, "smooth": 0.95, "spikes": 0.6}
+"""Share of the error of the published kernels that the trained ones stay below."""
+
+
 def lopsided_pyramid() -> PyramidIntegrator:
     """A pyramid whose kernels differ, so that it is not its own transpose."""
-    pyramid = PyramidIntegrator()
+    pyramid = PyramidIntegrator("published")
+    side = torch.tensor([0.5, 0.6, 0.2])
     with torch.no_grad():
-        pyramid.h2.copy_(torch.tensor([0.5, 0.6, 0.2]))
+        pyramid.h2.copy_(torch.stack([side[y] * side[x] for y, x in EIGHTH])[None])
     return pyramid
+
+
+EIGHTH = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
+
+
+def whole(kernels: Tensor, reach: int) -> Tensor:
+    """Kernels of which an eighth each is given, filled in by their symmetry."""
+    out = torch.zeros(len(kernels), 2 * reach + 1, 2 * reach + 1, dtype=F64)
+    for k, (y, x) in enumerate(EIGHTH[: kernels.shape[1]]):
+        for down, right in {(a * v, b * u) for a in (1, -1) for b in (1, -1) for v, u in ((y, x), (x, y))}:
+            out[:, reach + down, reach + right] = kernels[:, k].double()
+    return out
 
 
 INTEGRATORS: dict[str, Integrator] = {
@@ -26,6 +44,7 @@ INTEGRATORS: dict[str, Integrator] = {
     "free": FFTIntegrator(),
     "torus": FFTIntegrator(compact=True),
     "pyramid": PyramidIntegrator(),
+    "published pyramid": PyramidIntegrator("published"),
     "lopsided pyramid": lopsided_pyramid(),
 }
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
@@ -44,9 +63,9 @@ def test_forward_and_differentiate_are_the_functions(integrator: Integrator) -> 
         expected = poisson_fft(b, compact=integrator.compact)
     else:
         assert isinstance(integrator, PyramidIntegrator)
-        h1, h2 = ([k[2], k[1], k[0], k[1], k[2]] for k in (integrator.h1.tolist(), integrator.h2.tolist()))
-        g = [integrator.g[1].item(), integrator.g[0].item(), integrator.g[1].item()]
-        expected = poisson_pyramid(b, *(torch.tensor(k, dtype=F64) for k in (h1, h2, g)))
+        h1, h2 = (whole(k.detach(), 2) for k in (integrator.h1, integrator.h2))
+        g = integrator.g.detach()
+        expected = poisson_pyramid(b, h1, h2, whole(g, 1 if g.shape[1] == 3 else 2))
     torch.testing.assert_close(integrator(b), expected, rtol=1e-6, atol=1e-6)
     operator = difference_x if isinstance(integrator, ScanlineIntegrator) else laplacian
     torch.testing.assert_close(integrator.differentiate(b), operator(b))
@@ -99,20 +118,35 @@ def test_half_precision(integrator: Integrator, dtype: torch.dtype) -> None:
         assert ((out.to(F64) - expected).abs() <= 0.02 * expected.abs().max()).all()
 
 
-def test_pyramid_has_half_kernels_as_parameters() -> None:
-    pyramid = PyramidIntegrator()
-    state = {name: tuple(value.shape) for name, value in pyramid.state_dict().items()}
-    assert state == {"h1": (3,), "h2": (3,), "g": (2,)}
+def test_pyramid_has_eighths_of_kernels_as_parameters() -> None:
+    for weights, levels, last in (("published", 1, 3), ("trained", 5, 6)):
+        state = {name: tuple(value.shape) for name, value in PyramidIntegrator(weights).state_dict().items()}
+        assert state == {"h1": (levels, 6), "h2": (levels, 6), "g": (levels, last)}
     assert not list(ScanlineIntegrator().parameters())
     assert not list(FFTIntegrator().parameters())
-    again = PyramidIntegrator()
+    again = PyramidIntegrator("published")
     again.load_state_dict(lopsided_pyramid().state_dict())
     b = random(1, 1, 9, 8)
     torch.testing.assert_close(again(b), lopsided_pyramid()(b))
+    with pytest.raises(ValueError, match="weights: expected 'trained' or 'published', got 'mine'"):
+        PyramidIntegrator("mine")
+
+
+def test_published_kernels_are_those_of_farbman() -> None:
+    b, (h, g) = random(1, 1, 33, 20), (torch.tensor([0.15, 0.5, 0.7, 0.5, 0.15]), torch.tensor([0.175, 0.547, 0.175]))
+    torch.testing.assert_close(PyramidIntegrator("published")(b), poisson_pyramid(b, *(k.double() for k in (h, h, g))))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [48, 131])
+def test_trained_kernels_are_better_where_they_were_not_trained(kind: str, size: int) -> None:
+    pictures = laplacian_pictures(kind, 4, size, seed=123_456).float()
+    trained, published = (relative_errors(PyramidIntegrator(w), pictures) for w in ("trained", "published"))
+    assert trained[0] < BETTER[kind] * published[0]
 
 
 def test_pyramid_learns_to_undo_the_laplacian_better() -> None:
-    pyramid = PyramidIntegrator()
+    pyramid = PyramidIntegrator("published")
     u = torch.nn.functional.pad(torch.rand(1, 1, 20, 20, generator=torch.Generator().manual_seed(0)), (6, 6, 6, 6))
     optimizer = torch.optim.Adam(pyramid.parameters(), lr=1e-3)
     losses = []
