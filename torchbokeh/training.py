@@ -125,7 +125,7 @@ def fit_integrator(
         optimizer.zero_grad()
         off = pyramid(buffers) - pictures
         loss = (off.square().sum((2, 3)) / energy + off.abs().sum((2, 3)) / size).mean()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         return loss.detach()
 
     for _ in range(steps):
@@ -133,4 +133,4 @@ def fit_integrator(
         optimizer = torch.optim.LBFGS(
             pyramid.parameters(), max_iter=ITERATIONS, history_size=ITERATIONS, line_search_fn="strong_wolfe"
         )
-        yield float(optimizer.step(closure)), pyramid  # type: ignore[no-untyped-call]
+        yield float(optimizer.step(closure)), pyramid

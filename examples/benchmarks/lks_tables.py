@@ -6,7 +6,7 @@ Prints one Markdown table and writes a sheet of pictures for each scene.
 
 SSIM and PSNR are of ``clip(x, 0, 1) ** (1/2.2)``; a border as wide as the largest radius is left out. Medians.
 
-    python examples/benchmarks/motion.py [--size 256] [--radius 13] [--views 1024] [--repeat 3] [--out FOLDER]
+    python examples/benchmarks/lks_tables.py [--size 256] [--radius 13] [--views 1024] [--repeat 3] [--out FOLDER]
 """
 
 import argparse
