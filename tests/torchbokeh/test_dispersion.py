@@ -278,7 +278,7 @@ def test_copies_pickles_state_and_dtype() -> None:
 def test_it_prints_what_it_is() -> None:
     text = repr(Dispersion("SF10", 0.25, torch.tensor([0.01, 0.02]), axial_map=None, lateral_map=FieldMap("square")))
     assert text == (
-        "Dispersion('SF10', axial=0.25, lateral=(0.01, 0.02), axial_map=None, lateral_map=FieldMap((t)**2), "
+        "Dispersion('SF10', axial=0.25, lateral=(0.01, 0.02), axial_map=None, lateral_map=FieldMap(t**2), "
         "spectrum='rgb', reference=650, equaliser=None)"
     )
     assert "Dispersion('BK7', axial=1" in repr(tb.ThinLens(FOCAL, F_NUMBER, FOCUS, SENSOR, dispersion=Dispersion()))
