@@ -108,9 +108,7 @@ def _of_light(
     """The channels of a picture, with the radii and in the size that they have in light of one wavelength."""
     shift = lens.coc_shift(wavelength, field.x.shape[1] - 2 * margin, field)
 
-    def shifted(coc: Tensor | None) -> Tensor | None:
-        if coc is None:
-            return None
+    def shifted(coc: Tensor) -> Tensor:
         moved = coc + (shift[:, None] if coc.dim() == 5 and shift.dim() == 4 else shift).to(coc.dtype)
         return moved if limit is None else moved.clamp(-limit, limit)
 
@@ -120,10 +118,9 @@ def _of_light(
     behind = None
     if given.behind is not None:
         colour, coc = given.behind
-        behind = colour[:, channels], shifted(coc)
-    signed = shifted(given.signed)
-    assert signed is not None
-    one = Given(image, signed, given.motion, shifted(given.ends), behind)
+        behind = colour[:, channels], None if coc is None else shifted(coc)
+    ends = None if given.ends is None else shifted(given.ends)
+    one = Given(image, shifted(given.signed), given.motion, ends, behind)
     return _enlarged(one, wavelength, lens, field, margin) if enlarged else one
 
 
@@ -141,21 +138,16 @@ def _enlarged(given: Given, wavelength: float, lens: Lens, field: Field, margin:
 
     alpha = given.image[:, :, -1:].flatten(0, 1) if given.image.dim() == 5 else None
 
-    def at(t: Tensor | None, mode: str = "nearest") -> Tensor | None:
-        if t is None:
-            return None
+    def at(t: Tensor, mode: str = "nearest") -> Tensor:
         if alpha is not None and mode == "nearest":  # the rim of a layer takes its maps along
             t = continued(t.flatten(0, 1), alpha).view_as(t)
         flat = t.flatten(1, -3)
         return F.grid_sample(flat, grid.to(t.dtype), mode=mode, padding_mode="border", align_corners=False).view_as(t)
 
-    image, signed = at(given.image, "bilinear"), at(given.signed)
-    assert image is not None
-    assert signed is not None
-    moved = [m for m in (at(way) for way in ways(given.motion)) if m is not None]
+    ends = None if given.ends is None else at(given.ends)
     behind = None
     if given.behind is not None:
-        colour = at(given.behind[0], "bilinear")
-        assert colour is not None
-        behind = colour, at(given.behind[1])
-    return Given(image, signed, moved or None, at(given.ends), behind)
+        colour, coc = given.behind
+        behind = at(colour, "bilinear"), None if coc is None else at(coc)
+    moved = [at(way) for way in ways(given.motion)]
+    return Given(at(given.image, "bilinear"), at(given.signed), moved or None, ends, behind)
