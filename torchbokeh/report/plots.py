@@ -218,22 +218,36 @@ _SIDES = ((1, 0), (0, 1), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 def _truth(rows: list[Row]) -> Figure:
     """Error against the truth by time, the mean over the scenes of each input and quality."""
+    colours = {"one layer": "#1f77b4", "image": "#d62728", "image and background": "#2ca02c", "layers": "#9467bd"}
+    noise = [1 - row["ssim_truth"] for row in rows if row["input"] == "truth"]
+    found = [(r["input"], r["quality"], r["seconds"], 1 - r["ssim_truth"]) for r in rows if r["input"] in colours]
+    return _against_truth(found, colours, noise, "LensBlur by input and quality, mean over the recipes")
+
+
+def _against_truth(
+    found: list[tuple[str, str, float, float]], colours: dict[str, str], noise: list[float], title: str
+) -> Figure:
+    """A line for each name, a point for each of its settings: the mean of all with that name and setting.
+
+    Args:
+        found: name, setting, seconds and error.
+        colours: of the lines.
+        noise: errors between two halves of the truth.
+        title: of the plot.
+    """
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
-    colours = {"one layer": "#1f77b4", "image": "#d62728", "image and background": "#2ca02c", "layers": "#9467bd"}
     labels = []
-    for given, colour in colours.items():
-        chosen = [row for row in rows if row["input"] == given]
+    for name, colour in colours.items():
         points = []
-        for quality in dict.fromkeys(row["quality"] for row in chosen):
-            of = [row for row in chosen if row["quality"] == quality]
-            points.append((_mean([row["seconds"] for row in of]), _mean([1 - row["ssim_truth"] for row in of])))
-            labels.append(_Label(*points[-1], quality, colour, (0, 1)))
-        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=given, markersize=6)
-    noise = _mean([1 - row["ssim_truth"] for row in rows if row["input"] == "truth"])
-    axes.axhline(noise, color="0.6", linestyle="--", label="between two halves\nof the truth")
+        for setting in dict.fromkeys(f[1] for f in found if f[0] == name):
+            of = [f for f in found if f[:2] == (name, setting)]
+            points.append((_mean([f[2] for f in of]), _mean([f[3] for f in of])))
+            labels.append(_Label(*points[-1], setting, colour, (0, 1)))
+        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=name, markersize=6)
+    axes.axhline(_mean(noise), color="0.6", linestyle="--", label="between two halves\nof the truth")
     axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="1 - SSIM against the truth")
-    axes.set_title("LensBlur by input and quality, mean over the recipes")
+    axes.set_title(title)
     axes.margins(0.15)
     _plain_seconds(axes)
     _plain_errors(axes)
@@ -328,28 +342,10 @@ def _threads(rows: list[Row]) -> Figure:
 
 def _chromatic(rows: list[Row]) -> Figure:
     """Error against the truth by time with dispersion, the mean over all cases of each method and setting."""
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
-    axes = figure.subplots()
-    labels = []
-    names = dict.fromkeys(row["method"] for row in rows if row["method"] != "truth")
-    for name, colour in zip(names, ("#9467bd", "#d62728", "#1f77b4"), strict=True):
-        points = []
-        for setting in dict.fromkeys(row["setting"] for row in rows if row["method"] == name):
-            of = [row for row in rows if (row["method"], row["setting"]) == (name, setting)]
-            points.append((_mean([row["seconds"] for row in of]), _mean([1 - row["ssim"] for row in of])))
-            labels.append(_Label(*points[-1], setting, colour, (0, 1)))
-        axes.plot(*zip(*points, strict=True), "o-", color=colour, label=name, markersize=6)
-    noise = _mean([1 - row["ssim"] for row in rows if row["method"] == "truth"])
-    axes.axhline(noise, color="0.6", linestyle="--", label="between two truths")
-    axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="1 - SSIM against the truth")
-    axes.set_title("With dispersion, mean over scenes, spectra and strengths")
-    axes.margins(0.15)
-    _plain_seconds(axes)
-    _plain_errors(axes)
-    axes.grid(alpha=0.25, which="both")
-    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
-    _write_labels(figure, axes, labels)
-    return figure
+    noise = [1 - row["ssim"] for row in rows if row["method"] == "truth"]
+    found = [(r["method"], r["setting"], r["seconds"], 1 - r["ssim"]) for r in rows if r["method"] != "truth"]
+    colours = dict(zip(dict.fromkeys(f[0] for f in found), ("#9467bd", "#d62728", "#1f77b4"), strict=True))
+    return _against_truth(found, colours, noise, "With dispersion, mean over scenes, spectra and strengths")
 
 
 def _distinct(lines: Sequence[Any]) -> None:
