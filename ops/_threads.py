@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -40,6 +40,10 @@ def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]], name: 
     The calling thread takes part; the others live for one call only, so nothing is left behind that a forked process
     could trip over. The pieces must not depend on each other.
 
+    The number is looked up at every call, and is all that limits the kernels: one in a worker of a ``DataLoader``,
+    which tells torch so, and in the processes of ``torchrun`` unless ``OMP_NUM_THREADS`` says more. Processes that are
+    started otherwise take all cores each, until `torch.set_num_threads` shares these out.
+
     Args:
         work: the function.
         pieces: its arguments, one tuple for each call.
@@ -58,10 +62,20 @@ def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]], name: 
 
     with stage(name):
         helpers = [threading.Thread(target=take) for _ in range(min(torch.get_num_threads(), len(pieces)) - 1)]
-        for helper in helpers:
-            helper.start()
-        take()
-        for helper in helpers:
-            helper.join()
+        try:
+            with suppress(RuntimeError):  # the system has no more threads: those that there are do all the work
+                for helper in helpers:
+                    helper.start()
+            take()
+            _join(helpers)
+        except BaseException as error:  # Ctrl-C: the helpers stop after the piece that they are at
+            errors.append(error)
+            _join(helpers)
     if errors:
         raise errors[0]
+
+
+def _join(threads: list[threading.Thread]) -> None:
+    for thread in threads:
+        if thread.is_alive():  # one that could not be started is not
+            thread.join()

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from torchbokeh.ops._files import replacing
+from torchbokeh.ops._processes import end_with_parent, ending_children, starting_children
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.model import PsfModel
 from torchbokeh.psfs.refit import Sparse, reconstruction
@@ -79,6 +82,8 @@ def build(
         The bank. Its ``info`` holds the target, and for every sample what `Built` says of it.
 
     Raises:
+        ChildProcessError: a worker was killed.
+        OSError: a file cannot be written.
         ValueError: ``workers`` is below 1.
     """
     if workers < 1:
@@ -116,7 +121,8 @@ def _claim(parts: Path, order: str) -> None:
         return
     for file in parts.glob("*.npz"):
         file.unlink()
-    note.write_text(order)
+    with replacing(note) as temporary:
+        temporary.write_text(order)
 
 
 def _part(parts: Path, number: int) -> Path:
@@ -128,14 +134,20 @@ def _finished(model: PsfModel, numbers: list[int], target: Target, workers: int,
     jobs = [(model, k, target, _part(parts, k)) for k in reversed(numbers)]
     if not jobs:
         return
-    with _single_threads(), ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        running = [pool.submit(_job, *job) for job in jobs]
-        try:
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
+    try:
+        with ending_children():
+            with _single_threads(), starting_children():
+                running = [pool.submit(_job, *job) for job in jobs]
             for done in as_completed(running):
                 yield done.result()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+    except BrokenProcessPool as error:
+        what = "a worker ended before its sample was done, perhaps for want of memory; run it again to go on"
+        raise ChildProcessError(f"{parts}: {what}") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for temporary in parts.glob(".*"):  # of workers that were ended
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -157,10 +169,8 @@ def _job(model: PsfModel, number: int, target: Target, path: Path) -> int:
     found = build_sample(model, number, target)
     points, values = found.represented.sparse
     scores = [found.support, found.ssim, found.ssim_frame, found.l1, found.seconds]
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "wb") as file:
-        np.savez(file, domain=found.represented.domain, points=points, values=values, scores=np.array(scores))
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        np.savez(temporary, domain=found.represented.domain, points=points, values=values, scores=np.array(scores))
     return number
 
 

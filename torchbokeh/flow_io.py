@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchbokeh.image_io import read_npy
+from torchbokeh.ops._checks import check_pixels
+
 MAGIC = 202021.25
 """Begins every Middlebury flow file."""
-
-LARGEST = 1 << 28
-"""Pixels of a flow file, at most."""
 
 
 def read_flow(path: str | Path) -> Tensor:
@@ -54,18 +54,19 @@ def _read_flo(path: Path) -> np.ndarray:
         magic, width, height = struct.unpack("<fii", head)
         if magic != MAGIC:
             raise ValueError(f"{path}: expected a Middlebury flow file, but it begins with {head[:4]!r}")
-        if not (width > 0 and height > 0 and width * height <= LARGEST) or size != 12 + 8 * width * height:
+        if not (width > 0 and height > 0) or size != 12 + 8 * width * height:
             raise ValueError(f"{path}: is {size} bytes long, which does not fit its header of {width} x {height} px")
+        check_pixels("size", height, width)
         return np.frombuffer(file.read(), "<f4").reshape(height, width, 2).transpose(2, 0, 1)
 
 
 def _read_npy(path: Path) -> np.ndarray:
     try:
-        flow = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        flow = read_npy(path)
+    except Exception as error:  # NumPy raises whatever it likes on a broken file
         raise ValueError(f"{path}: cannot be read as an array ({error})") from error
-    if not isinstance(flow, np.ndarray) or flow.ndim != 3 or 2 not in (flow.shape[0], flow.shape[2]):
-        raise ValueError(f"{path}: expected shape (2, H, W) or (H, W, 2), got {getattr(flow, 'shape', 'an archive')}")
+    if flow.ndim != 3 or 2 not in (flow.shape[0], flow.shape[2]) or 0 in flow.shape:
+        raise ValueError(f"{path}: expected shape (2, H, W) or (H, W, 2), got {flow.shape}")
     if flow.dtype.kind not in "fiu":
         raise ValueError(f"{path}: expected numbers, got {flow.dtype}")
     return flow if flow.shape[0] == 2 else flow.transpose(2, 0, 1)

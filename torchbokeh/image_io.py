@@ -3,20 +3,23 @@
 Integer samples are sRGB-encoded and are decoded to linear light; floating-point samples are linear already.
 """
 
-import os
-import secrets
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import io
+import struct
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_pixels
+from torchbokeh.ops._files import check_place, replacing
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+_DEFLATE = 1032
+"""Bytes that one byte of a deflated file stands for, at most: a header that promises more is not to be believed."""
 
 
 def read_image(path: str | Path) -> Tensor:
@@ -77,7 +80,8 @@ def read_map(path: str | Path, scale: float = 1.0) -> Tensor:
     if not np.array_equal(values, np.broadcast_to(first, values.shape), equal_nan=values.dtype.kind == "f"):
         raise ValueError(f"{path}: its {values.shape[2]} channels differ; save the map as one channel")
     # The product is taken in float64, so that a 32-bit integer does not lose digits before it is scaled.
-    return _to_tensor(first.astype(np.float64) * scale)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _to_tensor(first.astype(np.float64) * scale)
 
 
 def sample_map(values: Tensor, x: int, y: int) -> float:
@@ -156,37 +160,7 @@ def check_writable(path: str | Path) -> None:
             import OpenEXR  # noqa: F401
         except ImportError:
             raise ValueError(f"{path}: {_NEEDS_OPENEXR}") from None
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: the folder {path.parent} does not exist; create it first")
-    try:  # a real file: permission bits say nothing of read-only file systems
-        tempfile.TemporaryFile(dir=path.parent).close()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot write there ({error.strerror}); choose another folder") from None
-
-
-@contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` that becomes ``path`` when the block ends without an error.
-
-    Args:
-        path: the file to be written or replaced.
-
-    Yields:
-        A path in the same folder with the same extension; on an error it is removed and ``path`` kept.
-
-    Example:
-        >>> with replacing("notes.txt") as temporary:  # doctest: +SKIP
-        ...     temporary.write_text("whole or not at all")
-    """
-    path = Path(path)
-    temporary = path.with_name(f".torchbokeh-{secrets.token_hex(6)}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    check_place(path)
 
 
 def encode_srgb(image: Tensor, bits: int) -> np.ndarray:
@@ -212,7 +186,7 @@ def encode_srgb(image: Tensor, bits: int) -> np.ndarray:
 
 def _to_tensor(pixels: np.ndarray) -> Tensor:
     """``(H, W, C)`` of any dtype and byte order -> ``(1, C, H, W)`` float32."""
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf
+    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
         return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], dtype=np.float32))
 
 
@@ -223,6 +197,26 @@ def _drop_opaque_alpha(path: Path, pixels: np.ndarray) -> np.ndarray:
     if not (pixels[:, :, -1] >= opaque).all():
         raise ValueError(f"{path}: has transparent pixels; flatten it onto a background first")
     return pixels[:, :, :-1]
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array in an NPY file, no element of which is a Python object.
+
+    Raises:
+        ValueError: the file is something else, or shorter than its header says.
+    """
+    found = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a size that is a lie allocates nothing
+    if not isinstance(found, np.ndarray):
+        found.close()
+        raise ValueError("it is an archive of arrays; save one array")
+    return np.array(found)
+
+
+def _check_claim(held: int, height: int, width: int, pixel_bits: int, expansion: int) -> None:
+    """Refuse a header that promises more than ``held`` bytes can hold, before memory is asked for it."""
+    check_pixels("size", height, width)
+    if height * width * pixel_bits > 8 * held * expansion:
+        raise ValueError(f"its header promises {width} x {height} pixels of {pixel_bits} bits, but it has {held} bytes")
 
 
 def _load(path: Path, prefer: str = "") -> np.ndarray:
@@ -250,14 +244,21 @@ def _load(path: Path, prefer: str = "") -> np.ndarray:
 def _read_png_jpeg(path: Path) -> np.ndarray:
     from PIL import Image, ImageOps
 
-    with path.open("rb") as file:
-        head = file.read(26)
-    depth, colour = (head[24], head[25]) if head.startswith(_PNG_SIGNATURE) and len(head) == 26 else (8, 2)
+    data = path.read_bytes()  # a decoder that is told to read more than there is then gets no more
+    depth, colour = 8, 2
+    if data.startswith(_PNG_SIGNATURE) and len(data) >= 26:
+        width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
+        _check_claim(len(data), height, width, depth * {2: 3, 4: 2, 6: 4}.get(colour, 1), _DEFLATE)
     if depth == 16 and colour in (2, 6):  # Pillow keeps 8 of the 16 bits of a colour PNG
         from kornia_rs.io import read_image_png_u16
 
         return np.asarray(read_image_png_u16(str(path), "rgb" if colour == 2 else "rgba"))
-    with Image.open(path, formats=("PNG", "JPEG")) as opened:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is that of `check_pixels`
+        opened = Image.open(io.BytesIO(data), formats=("PNG", "JPEG"))
+    with opened:
+        if opened.format == "JPEG":  # a block of 8 x 8 samples takes at least a bit
+            _check_claim(len(data), opened.height, opened.width, 8 * len(opened.getbands()), _DEFLATE)
         image: Image.Image = ImageOps.exif_transpose(opened)
         if depth == 16 and colour == 0:
             return np.asarray(image).astype(np.uint16)
@@ -278,6 +279,12 @@ def _read_tiff(path: Path) -> np.ndarray:
         page = tiff.pages.first
         if page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
             raise ValueError(f"its colours are {page.photometric.name}; save it as grey or RGB")
+        bits = page.bitspersample * page.samplesperpixel * page.imagedepth
+        expansion = {1: 1, 8: _DEFLATE, 32946: _DEFLATE}.get(page.compression)  # of others only the number of pixels
+        held = path.stat().st_size
+        _check_claim(held, page.imagelength, page.imagewidth, bits if expansion else 0, expansion or 1)
+        if sum(page.databytecounts) > held:
+            raise ValueError(f"its header promises {sum(page.databytecounts)} bytes of data, but it has {held}")
         pixels = page.asarray()
         return np.moveaxis(pixels, 0, -1) if page.axes == "SYX" else pixels
 
@@ -290,6 +297,11 @@ def _read_exr(path: Path, prefer: str) -> np.ndarray:
         import OpenEXR
     except ImportError:
         raise ValueError(_NEEDS_OPENEXR) from None
+    with OpenEXR.File(str(path), header_only=True) as file:
+        for part in file.parts:
+            left, top, right, bottom = (int(n) for corner in part.header["dataWindow"] for n in corner)
+            bits = 16 * len(part.header["channels"])
+            _check_claim(path.stat().st_size, bottom - top + 1, right - left + 1, bits, _DEFLATE)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     if prefer in channels:
@@ -301,24 +313,19 @@ def _read_exr(path: Path, prefer: str) -> np.ndarray:
     return next(iter(channels.values()))
 
 
-def _read_npy(path: Path) -> np.ndarray:
-    return np.asarray(np.load(path, allow_pickle=False))
-
-
 def _read_pfm(path: Path) -> np.ndarray:
     """Portable float map: three lines of header, then float32 rows from the bottom up."""
     with path.open("rb") as file:
         magic, size, scale = (file.readline(64).decode("ascii").strip() for _ in range(3))
-        samples = file.read()
-    if magic not in ("Pf", "PF"):
-        raise ValueError(f"it starts with {magic!r}, not with Pf or PF")
-    width, height = (int(n) for n in size.split())
-    order = "<" if float(scale) < 0 else ">"
-    pixels = np.frombuffer(samples, dtype=f"{order}f4")
-    shape = (height, width, 1 if magic == "Pf" else 3)
-    if pixels.size != np.prod(shape):
-        raise ValueError(f"its header promises {np.prod(shape)} samples, but it holds {pixels.size}")
-    return pixels.reshape(shape)[::-1]
+        if magic not in ("Pf", "PF"):
+            raise ValueError(f"it starts with {magic!r}, not with Pf or PF")
+        width, height = (int(n) for n in size.split())
+        order, channels = "<" if float(scale) < 0 else ">", 1 if magic == "Pf" else 3
+        held = path.stat().st_size - file.tell()
+        if width < 1 or height < 1 or held != 4 * height * width * channels:
+            raise ValueError(f"its header promises {height * width * channels} samples, but it holds {held / 4:g}")
+        check_pixels("size", height, width)
+        return np.frombuffer(file.read(), f"{order}f4").reshape(height, width, channels)[::-1]
 
 
 def _write_png(path: Path, linear: Tensor) -> None:
@@ -338,8 +345,11 @@ def _write_exr(path: Path, linear: Tensor) -> None:
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     rgb = np.ascontiguousarray(linear[0].permute(1, 2, 0).numpy())
-    with OpenEXR.File(header, {"RGB": rgb}) as file:
-        file.write(str(path))
+    try:
+        with OpenEXR.File(header, {"RGB": rgb}) as file:
+            file.write(str(path))
+    except RuntimeError as error:  # of a full disk too: 'Failed to ... "the file's name". No space left on device.'
+        raise OSError(str(error).rpartition('". ')[2].rstrip(".")) from error
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
@@ -348,7 +358,7 @@ _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".jpeg": _read_png_jpeg,
     ".tif": _read_tiff,
     ".tiff": _read_tiff,
-    ".npy": _read_npy,
+    ".npy": read_npy,
     ".pfm": _read_pfm,
 }
 _WRITERS: dict[str, Callable[[Path, Tensor], None]] = {

@@ -335,7 +335,7 @@ def test_check_writable_tries_the_folder(tmp_path, monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("torchbokeh.image_io.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("torchbokeh.ops._files.tempfile.TemporaryFile", refuse)
     with pytest.raises(ValueError, match=r"a\.png: cannot write there \(Permission denied\); choose another"):
         check_writable(tmp_path / "a.png")
 

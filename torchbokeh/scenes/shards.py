@@ -23,15 +23,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from torchbokeh.image_io import replacing
+from torchbokeh.ops._processes import end_with_parent, ending_children, starting_children
+from torchbokeh.scenes._shard_entries import KEYS, LAYERS, MAPS, SUFFIXES, decoded, entries_of
 
 if TYPE_CHECKING:
     from webdataset import DataPipeline
 
 _MANIFEST = "dataset.json"
-_MAPS = ("image", "depth", "motion", "coc", "target")
-_LAYERS = {"layers": "layers", "layer_depth": "depth", "layer_motion": "motion"}  # key of the sample: of the npz
-_KEYS = (*_MAPS, *_LAYERS, "lens", "recipe", "index")
-_SUFFIXES = (*(f"{name}.npy" for name in _MAPS), "layers.npz", "meta.json")
+_MOST_FILES = 10**6  # what the six digits of their names can tell apart
 
 
 def write_shards(
@@ -73,6 +72,8 @@ def write_shards(
         The files that this call wrote, in order; those that were there already are not among them.
 
     Raises:
+        ChildProcessError: a worker was killed.
+        OSError: a file cannot be written.
         TypeError: ``settings()`` holds what JSON cannot.
         ValueError: an argument out of its range, a folder that cannot be made or holds another data set (the message
             names the setting that differs), or a sample without the expected keys.
@@ -112,10 +113,14 @@ def write_shards(
         num_workers=workers,
         collate_fn=list,  # what a worker made, as it is
         generator=torch.Generator(),  # the loader draws a seed; the caller's random numbers stay as they are
+        worker_init_fn=_end_with_parent,
     )
-    samples = iter(loader)
     total, left = (sum(map(len, some.values())) for some in (files, missing))
-    with tqdm(total=total, initial=total - left, unit="sample", disable=None if show_progress else True) as progress:
+    bar = tqdm(total=total, initial=total - left, unit="sample", disable=None if show_progress else True)
+    with bar as progress, ending_children():
+        with starting_children():
+            loading = iter(loader)
+        samples = _made(loading)
         for path, indices in missing.items():
             with _publishing(path) as file, tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
                 for _ in indices:
@@ -153,7 +158,10 @@ def shard_indices(count: int, per_shard: int = 100, shard: tuple[int, int] = (1,
     k, m = shard
     if not 1 <= k <= m:
         raise ValueError(f"shard: expected (k, m) with 1 <= k <= m, got ({k}, {m})")
-    numbers = range(k - 1, math.ceil(count / per_shard), m)
+    least = -(-count // _MOST_FILES)
+    if per_shard < least:
+        raise ValueError(f"per_shard: expected at least {least} for {count} samples, got {per_shard}")
+    numbers = range(k - 1, -(-count // per_shard), m)
     return {f"shard-{j:06d}.tar": range(j * per_shard, min((j + 1) * per_shard, count)) for j in numbers}
 
 
@@ -202,9 +210,9 @@ def read_shards(
     if shuffle < 0:
         raise ValueError(f"shuffle: expected at least 0, got {shuffle}")
     keys = (keys,) if isinstance(keys, str) else keys
-    unknown = {*(keys or ())} - {*_KEYS}
+    unknown = {*(keys or ())} - {*KEYS}
     if unknown:
-        raise ValueError(f"keys: expected some of {', '.join(_KEYS)}, got {min(unknown)!r}")
+        raise ValueError(f"keys: expected some of {', '.join(KEYS)}, got {min(unknown)!r}")
     each = [source] if isinstance(source, str | Path) else source
     urls = [url for one in each for url in _expand(one, partial)]
     if not urls:
@@ -215,12 +223,25 @@ def read_shards(
         wds.split_by_node,
         wds.split_by_worker,
         wds.detshuffle(len(urls), initial=len(urls), seed=seed) if shuffle else None,
-        _opened,
-        wds.tariterators.tar_file_expander,
+        entries_of,
         wds.tariterators.group_by_keys,
-        partial_of(_decoded, keys=_KEYS if keys is None else tuple(keys)),
+        partial_of(decoded, keys=KEYS if keys is None else tuple(keys)),
         wds.detshuffle(shuffle, initial=min(shuffle, 100), seed=seed) if shuffle else None,
     )
+
+
+def _made(loading: Iterator[Any]) -> Iterator[list[tuple[str, bytes]]]:
+    try:
+        yield from loading
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker (pid"):
+            raise
+        what = "a worker ended before its sample was made, perhaps for want of memory; call it again to go on"
+        raise ChildProcessError(what) from error
+
+
+def _end_with_parent(worker: int) -> None:
+    end_with_parent()
 
 
 class _Encoded(Dataset[list[tuple[str, bytes]]]):
@@ -231,20 +252,20 @@ class _Encoded(Dataset[list[tuple[str, bytes]]]):
 
     def __getitem__(self, index: int) -> list[tuple[str, bytes]]:
         sample = self.dataset[index]
-        if sample.keys() != {*_KEYS}:
-            raise ValueError(f"sample {index}: expected the keys {', '.join(_KEYS)}, got {', '.join(sample)}")
+        if sample.keys() != {*KEYS}:
+            raise ValueError(f"sample {index}: expected the keys {', '.join(KEYS)}, got {', '.join(sample)}")
         meta = {
             "index": sample["index"],
             "recipe": sample["recipe"],
             "lens": {name: float(value) for name, value in sample["lens"].items()},  # float32 comes back as it was
         }
-        packed = _npz({name: _npy(sample[key]) for key, name in _LAYERS.items()})
-        data = [*(_npy(sample[name]) for name in _MAPS), packed, json.dumps(meta).encode()]
+        packed = _npz({name: _npy(sample[key]) for key, name in LAYERS.items()})
+        data = [*(_npy(sample[name]) for name in MAPS), packed, json.dumps(meta).encode()]
         return list(zip(_names(index), data, strict=True))
 
 
 def _names(index: int) -> list[str]:
-    return [f"{index:08d}.{suffix}" for suffix in _SUFFIXES]
+    return [f"{index:08d}.{suffix}" for suffix in SUFFIXES]
 
 
 def _npy(values: Tensor) -> bytes:
@@ -295,9 +316,11 @@ def _claim(out: Path, dataset: Dataset[dict[str, Any]], count: int, per_shard: i
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        if not {"count", "per_shard", "settings"} <= manifest.keys():
+        settings, *numbers = (manifest[name] for name in ("settings", "count", "per_shard"))
+        if not isinstance(settings, dict) or not all(type(n) is int for n in numbers):
             raise ValueError
-    except (ValueError, AttributeError):
+        shard_indices(*numbers)
+    except (ValueError, TypeError, KeyError, RecursionError):
         raise ValueError(f"{path}: is not the manifest of a data set; choose another folder") from None
     return manifest
 
@@ -334,6 +357,10 @@ def _publishing(path: Path) -> Iterator[BinaryIO]:
         except FileNotFoundError:
             if not path.exists():  # else a second run has just published the same bytes, and cleaned up
                 raise
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):  # it is of the samples
+            raise
+        raise OSError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -385,30 +412,3 @@ def _enough(shards: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         want = f"expected at least one file for each of {processes} processes"
         raise ValueError(f"source: {want}, got {len(shards)}; write them with a smaller per_shard")
     yield from shards
-
-
-def _opened(shards: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """WebDataset's own opener leaves files open until they are garbage."""
-    from webdataset import gopen
-
-    for shard in shards:
-        with gopen(shard["url"]) as stream:
-            yield {**shard, "stream": stream}
-
-
-def _decoded(samples: Iterable[dict[str, Any]], keys: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-    for entries in samples:
-        missing = [suffix for suffix in _SUFFIXES if suffix not in entries]
-        if missing:
-            what = f"sample {entries['__key__']} has no entry {missing[0]}; was it written by write_shards?"
-            raise ValueError(f"{entries['__url__']}: {what}")
-        sample = json.loads(entries["meta.json"])
-        sample["lens"] = {name: torch.tensor(value, dtype=torch.float32) for name, value in sample["lens"].items()}
-        sample |= {name: torch.from_numpy(_load(entries[f"{name}.npy"])) for name in _MAPS if name in keys}
-        with _load(entries["layers.npz"]) as archive:  # unpacks each array as it is asked for
-            sample |= {key: torch.from_numpy(archive[name]) for key, name in _LAYERS.items() if key in keys}
-        yield {key: sample[key] for key in keys}
-
-
-def _load(data: bytes) -> Any:
-    return np.load(io.BytesIO(data), allow_pickle=False)
