@@ -5,18 +5,22 @@ they would be seen; so highlights are drawn densely, point by point.
 """
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import has_kernel
 from torchbokeh.ops.spans import MIN_RADIUS
 
 FINE = 2
 """Samples along each side of a pixel."""
 
-CHUNK = 1 << 22
-"""Most samples that the torch path expands at a time."""
+CHUNK = 1 << 20
+"""Most samples that are expanded at a time, or those of a single pixel: about 0.1 GB of scratch."""
 
 
 def splat_capsules(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
@@ -32,44 +36,114 @@ def splat_capsules(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tenso
     Returns:
         ``(B, C, H, W)``: every PSF sums to 1, with what falls outside the picture. Differentiable to all but
         ``pixels``.
-    """
-    maps = [values, radius, motion, centre]
-    if has_kernel(values) and not (torch.is_grad_enabled() and any(t.requires_grad for t in maps)):
-        from torchbokeh.ops import _capsule_kernels
 
-        source, *geometry = (t.detach() for t in maps)
-        return _capsule_kernels.splat_capsules(source, pixels, *geometry)
-    return _splat_capsules_torch(values, pixels, radius, motion, centre)
+    Raises:
+        TypeError: an argument is not a floating-point tensor, ``pixels`` not an integer one.
+        ValueError: shapes or devices do not fit, or a pixel is not in the picture.
+    """
+    check_image("values", values, ("B", "C", "H", "W"))
+    check_image("pixels", pixels, ("N",), like=values, integer=True)
+    for name, given, rest in (("radius", radius, ()), ("motion", motion, (2,)), ("centre", centre, (2,))):
+        check_image(name, given, (len(pixels), *rest), like=values)
+    count = values.numel() // max(values.shape[1], 1)
+    if len(pixels) and not 0 <= int(pixels.min()) <= int(pixels.max()) < count:
+        raise ValueError(f"pixels: expected indices of {count} pixels, got {int(pixels.min())} to {int(pixels.max())}")
+    return _Capsules.apply(values, pixels, radius, motion, centre)
+
+
+class _Capsules(torch.autograd.Function):
+    """A splat whose backward pass draws the PSFs anew, in pieces: no graph over their samples outlives it."""
+
+    @staticmethod
+    def forward(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
+        if has_kernel(values):
+            from torchbokeh.ops import _capsule_kernels
+
+            return _capsule_kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
+        return _splat_capsules_torch(values, pixels, radius, motion, centre)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, pixels, *geometry = ctx.saved_tensors
+        by_values, *by_geometry = _gather_capsules(grad, values, pixels, *geometry)
+        return by_values, None, *by_geometry
+
+
+def _flat(t: Tensor) -> Tensor:
+    return t.movedim(1, 0).reshape(t.shape[1], -1)
+
+
+def _unflat(t: Tensor, like: Tensor) -> Tensor:
+    b, c, h, w = like.shape
+    return t.reshape(c, b, h, w).movedim(0, 1)
 
 
 def _splat_capsules_torch(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
-    b, c, h, w = values.shape
-    flat = values.movedim(1, 0).reshape(c, -1)
+    flat = _flat(values)
     out = torch.zeros_like(flat)
+    for here, places in _pieces(pixels, radius, motion, centre):
+        target, inside = _targets(pixels[here], places, values.shape)
+        share = torch.where(inside, _shares(places, radius[here], motion[here], centre[here]), 0.0)
+        out.index_add_(1, target.flatten(), (flat[:, pixels[here], None] * share).flatten(1))
+    return _unflat(out, values)
+
+
+def _gather_capsules(
+    grad: Tensor, values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor
+) -> list[Tensor]:
+    """Gradients of ``values, radius, motion, centre``; ``grad`` is that of the picture."""
+    flat, slopes = _flat(values), _flat(grad)
+    by_values = torch.zeros_like(flat)
+    by_geometry = [torch.zeros_like(t) for t in (radius, motion, centre)]
+    for here, places in _pieces(pixels, radius, motion, centre):
+        target, inside = _targets(pixels[here], places, values.shape)
+        arriving = torch.where(inside, slopes[:, target], 0.0)
+        with torch.enable_grad():
+            leaves = [t[here].detach().requires_grad_() for t in (radius, motion, centre)]
+            share = _shares(places, *leaves)
+        by_values[:, pixels[here]] = (arriving * share.detach()).sum(2)
+        by_share = (arriving * flat[:, pixels[here], None]).sum(0)
+        for whole, part in zip(by_geometry, torch.autograd.grad(share, leaves, by_share), strict=True):
+            whole[here] = part
+    return [_unflat(by_values, values), *by_geometry]
+
+
+def _pieces(pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """The pixels in groups, with the whole offsets ``(M, 2)`` that any PSF reaches."""
     if not len(pixels):
-        return out.reshape(c, b, h, w).movedim(0, 1)
+        return
     # Half a pixel more than the reach, so that the sums of all samples of a PSF are whole.
     extent = radius.detach().clamp_min(MIN_RADIUS)[:, None] + motion.detach().abs() / 2 + centre.detach().abs()
     reach = math.ceil(float(extent.max())) + 1
-    at = torch.arange(-reach, reach + 1, device=values.device)
-    v, u = (t.flatten() for t in torch.meshgrid(at, at, indexing="ij"))
-    steps = ((torch.arange(FINE, device=values.device) + 0.5) / FINE - 0.5).to(values.dtype)
-    size = max(1, CHUNK // (len(u) * FINE * FINE))
+    at = torch.arange(-reach, reach + 1, device=pixels.device)
+    v, u = torch.meshgrid(at, at, indexing="ij")
+    places = torch.stack([u.flatten(), v.flatten()], 1)
+    size = max(1, CHUNK // (len(places) * FINE * FINE))
     for part in range(0, len(pixels), size):
-        here = slice(part, part + size)
-        light = torch.zeros(len(pixels[here]), len(u), dtype=values.dtype, device=values.device)
-        for dy in steps:
-            for dx in steps:
-                place = torch.stack([u + dx, v + dy], 1)
-                light = light + _density(place, radius[here], motion[here], centre[here])
-        light = light / light.sum(1, keepdim=True)
-        x, y = pixels[here, None] % w + u, pixels[here, None] // w % h + v
-        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-        target = (pixels[here, None] // (h * w) * h + y.clamp(0, h - 1)) * w + x.clamp(0, w - 1)
-        share = torch.where(inside, light, 0.0)
-        spread = flat[:, pixels[here], None] * share
-        out = out.index_add(1, target.flatten(), spread.flatten(1))
-    return out.reshape(c, b, h, w).movedim(0, 1)
+        yield slice(part, part + size), places
+
+
+def _targets(pixels: Tensor, places: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Flat indices ``(N, M)`` of the places around pixels of ``(B, C, H, W)``, and which of them are in the picture."""
+    _, _, h, w = shape
+    x, y = pixels[:, None] % w + places[:, 0], pixels[:, None] // w % h + places[:, 1]
+    inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    return (pixels[:, None] // (h * w) * h + y.clamp(0, h - 1)) * w + x.clamp(0, w - 1), inside
+
+
+def _shares(places: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
+    """Share ``(N, M)`` of its light that each PSF spreads to each place, the mean of some samples."""
+    steps = ((torch.arange(FINE, device=radius.device) + 0.5) / FINE - 0.5).to(radius.dtype)
+    light = torch.zeros(len(radius), len(places), dtype=radius.dtype, device=radius.device)
+    for dy in steps:
+        for dx in steps:
+            light = light + _density(places + torch.stack([dx, dy]), radius, motion, centre)
+    return light / light.sum(1, keepdim=True)
 
 
 def _density(place: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_kind, check_pixels, check_size
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
@@ -83,6 +83,7 @@ def splat_points(
     check_image("values", values, ("B", "C", "H", "W"))
     b, _, h, w = values.shape
     check_image("index", index, (b, 1, h, w), like=values, integer=True)
+    check_kind("table", table, PointTable)
     check_image("table.offsets", table.offsets, ("P", 2), like=values)
     check_image("table.weights", table.weights, (len(table.offsets),), like=values)
     check_image("table.counts", table.counts, ("K+1",), like=values, integer=True)
@@ -96,13 +97,17 @@ def splat_points(
         raise TypeError(f"pad: expected an int, got {type(pad).__name__}")
     if pad < 0:
         raise ValueError(f"pad: expected 0 or more, got {pad}")
+    if not torch.compiler.is_compiling():  # which may leave sizes open
+        height, width = (h, w) if size is None else check_size(size)
+        check_pixels("pad", height + 2 * pad, width + 2 * pad)
     if size is not None and position is None:
         raise ValueError("position: expected one beside size, got None")
     work = working_dtype(values.device)
     out = _splat_points_op(
         values.to(compute_dtype(values)),
         index.long(),
-        torch.cat([table.offsets.to(work), table.weights.to(work)[:, None]], 1),
+        table.offsets,
+        table.weights,
         table.counts.long(),
         None if rotation is None else rotation.to(work),
         None if position is None else position.to(work),
@@ -271,19 +276,26 @@ def _gather_points_torch(
     return grads
 
 
+def _packed(offsets: Tensor, weights: Tensor) -> Tensor:
+    """Points ``(P, 3)``: dx, dy, weight. Made anew in each pass: what waits for the backward one is the table."""
+    work = working_dtype(offsets.device)
+    return torch.cat([offsets.to(work), weights.to(work)[:, None]], 1)
+
+
 @torch.library.custom_op("torchbokeh::splat_points", mutates_args=())
 def _splat_points_op(
     values: Tensor,
     index: Tensor,
-    points: Tensor,
+    offsets: Tensor,
+    weights: Tensor,
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
     size: Sequence[int],
 ) -> Tensor:
-    """Points are ``(P, 3)``: dx, dy, weight."""
-    _check_contents(index, points, counts)
+    _check_contents(index, offsets, counts)
+    points = _packed(offsets, weights)
     if has_kernel(values):
         from torchbokeh.ops import _point_kernels
 
@@ -295,7 +307,8 @@ def _splat_points_op(
 def _(
     values: Tensor,
     index: Tensor,
-    points: Tensor,
+    offsets: Tensor,
+    weights: Tensor,
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
@@ -310,7 +323,8 @@ def _gather_points_op(
     grad: Tensor,
     values: Tensor,
     index: Tensor,
-    points: Tensor,
+    offsets: Tensor,
+    weights: Tensor,
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
@@ -318,6 +332,7 @@ def _gather_points_op(
     size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
+    points = _packed(offsets, weights)
     if has_kernel(values) and not geometry:
         from torchbokeh.ops import _point_kernels
 
@@ -330,7 +345,8 @@ def _(
     grad: Tensor,
     values: Tensor,
     index: Tensor,
-    points: Tensor,
+    offsets: Tensor,
+    weights: Tensor,
     counts: Tensor,
     rotation: Tensor | None,
     position: Tensor | None,
@@ -338,8 +354,13 @@ def _(
     size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
-    inputs = (values, points, rotation, position) if geometry else (values,)
-    return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs if t is not None]
+    like = [torch.empty_like(values, memory_format=torch.contiguous_format)]
+    if geometry:
+        like.append(_packed(offsets, weights))
+        like += [
+            torch.empty_like(t, memory_format=torch.contiguous_format) for t in (rotation, position) if t is not None
+        ]
+    return like
 
 
 def _points_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -348,14 +369,15 @@ def _points_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 
 def _points_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    _, _, points, _, rotation, position = ctx.saved_tensors
-    geometry = any(ctx.needs_input_grad[k] for k in (2, 4, 5))
+    _, _, offsets, weights, _, rotation, position = ctx.saved_tensors
+    geometry = any(ctx.needs_input_grad[k] for k in (2, 3, 5, 6))
     by_values, *rest = _gather_points_op(grad, *ctx.saved_tensors, ctx.pad, ctx.size, geometry)
-    found = iter(rest)
-    by_points, by_rotation, by_position = (
-        next(found) if geometry and t is not None else None for t in (points, rotation, position)
-    )
-    return by_values, None, by_points, None, by_rotation, by_position, None, None
+    if not geometry:
+        return by_values, *[None] * 8
+    by_points, *found = rest
+    by_rotation, by_position = (None if t is None else found.pop(0) for t in (rotation, position))
+    by_offsets, by_weights = by_points[:, :2].to(offsets.dtype), by_points[:, 2].to(weights.dtype)
+    return by_values, None, by_offsets, by_weights, None, by_rotation, by_position, None, None
 
 
 _splat_points_op.register_autograd(_points_backward, setup_context=_points_setup)

@@ -74,7 +74,9 @@ class NestedGrid:
         """Coordinates ``(..., n)`` to grid units ``[0, N]``; what lies outside the bounds goes to their border."""
         given = coordinates.to(torch.promote_types(coordinates.dtype, torch.float32))
         bounds, betas, cells = (given.new_tensor(values) for values in (self.bounds, self.betas, self.cells))
-        return (given / bounds).clamp(0, 1) ** betas.reciprocal() * cells
+        share = (given / bounds).clamp(0, 1)
+        above = share > 0  # at 0, where all sharp pixels are, the slope of a root is infinite
+        return torch.where(above, torch.where(above, share, 1.0) ** betas.reciprocal(), 0.0) * cells
 
     def unmap(self, place: Tensor) -> Tensor:
         """The inverse of `remap`, within the bounds."""

@@ -6,6 +6,10 @@ from torch import Tensor
 from torchbokeh.lens import Lens
 from torchbokeh.ops._checks import check_image
 
+WIDEST = 1e5
+"""Radius in px from which on radii are not told apart: such a disc covers any picture evenly. That of 1e7 px would put
+less on a pixel than counts as coverage (`torchbokeh.ops.composite.TINY`)."""
+
 
 def signed_coc(lens: Lens | None, image: Tensor, depth: object, coc: object, margin: int = 0) -> Tensor:
     """The signed CoC of a picture or of layers, from the one of ``depth`` and ``coc`` that is there.
@@ -27,9 +31,16 @@ def signed_map(
     if not is_coc:
         if lens is None:
             raise ValueError(f"{name}: expected coc, since there is no lens, got depth")
-        return lens.coc(checked, image.shape[-1] - 2 * margin)
+        try:
+            return lens.coc(checked, image.shape[-1] - 2 * margin).clamp(-WIDEST, WIDEST)
+        except ValueError as error:  # of a lens, it is the depth that is wrong
+            if name == "depth":
+                raise
+            raise ValueError(f"{name}: {str(error).removeprefix('depth: ')}") from error
     if not torch.compiler.is_compiling() and checked.numel():
         low, high = checked.detach().aminmax()  # several times as fast as `isfinite`; NaN is both
         if not bool((high - low).isfinite()):
             raise ValueError(f"{name}: expected finite radii, got {int((~checked.isfinite()).sum())} that are not")
+        if bool((high > WIDEST) | (low < -WIDEST)):
+            return checked.clamp(-WIDEST, WIDEST)
     return checked

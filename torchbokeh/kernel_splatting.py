@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torchbokeh._signed import signed_coc
 from torchbokeh.bank_splatting import bank_labels, blur_with_bank, needed
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.convolve import CONVOLVE_FROM, blur_uniform
@@ -64,6 +64,9 @@ class KernelSplatting(nn.Module):
     constant image stays constant. What lies in front of what does not count: for that see `LensBlur`. Wide PSFs are
     merged by radius (`torchbokeh.ops.merge`), so that a wider blur costs less.
 
+    A pixel that is NaN or infinite spoils its own channel of its own picture alone: the rows of its PSF, from there to
+    the right border; with a bank, or where one convolution does it, all of it.
+
     Memory on the CPU in float32 for three channels, result included and inputs not: at most 45 MB per megapixel forward
     and 125 MB backward where pixels are merged, 70 and 180 MB for exact quality, whatever the radius.
 
@@ -117,7 +120,7 @@ class KernelSplatting(nn.Module):
         self.quality = quality
         self.tolerance = tolerance
         self.bank = bank
-        self.interpolate = interpolate
+        self.interpolate = check_flag("interpolate", interpolate)
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
@@ -170,7 +173,8 @@ class KernelSplatting(nn.Module):
 
         Returns:
             ``(B, C, H, W)`` in the dtype of ``image``, differentiable to ``image``, ``coc`` and the aperture; with a
-            bank as `torchbokeh.bank_splatting.splat_bank` says.
+            bank as `torchbokeh.bank_splatting.splat_bank` says: without ``interpolate``, maps that only choose a sample
+            get no gradient.
 
         Raises:
             TypeError: an argument is not a floating-point tensor, or not a `SplattingPlan`.
@@ -185,7 +189,8 @@ class KernelSplatting(nn.Module):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
         given = [t for t in labels if t is not None]
         asked = any(t.requires_grad for t in given)
-        if plan.sharp and not asked:
+        profile = self.aperture.profile()
+        if plan.sharp and not (asked or profile.knots.requires_grad):
             return image.clone()
         with torch.autocast(image.device.type, enabled=False):
             dtype = compute_dtype(image, *given)
@@ -195,10 +200,9 @@ class KernelSplatting(nn.Module):
                     source, labels, self.bank, plan.quality.merging, plan.highest, interpolate=self.interpolate
                 )
             elif plan.uniform is not None and not asked:
-                out = blur_uniform(source, plan.uniform, self.aperture.profile())
+                out = blur_uniform(source, plan.uniform, profile)
             else:
-                radius, profile = needed(labels), self.aperture.profile()
-                out = blur_one_layer(source, radius, profile, plan.quality.merging, plan.highest)
+                out = blur_one_layer(source, needed(labels), profile, plan.quality.merging, plan.highest)
         return out.to(image.dtype)
 
     def _labels(self, image: Tensor, coc: Tensor | None, depth: Tensor | None, motion: Tensor | None) -> Labels:

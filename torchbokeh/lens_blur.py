@@ -32,6 +32,9 @@ from torchbokeh.quality import check_quality
 
 Background = Tensor | tuple[Tensor, Tensor] | None
 
+MOST = 64
+"""Sub-apertures along each direction of the lens, at most."""
+
 
 class LensBlur(nn.Module):
     """Depth of field: every pixel spreads over its circle of confusion, near surfaces cover far ones.
@@ -40,6 +43,21 @@ class LensBlur(nn.Module):
     stands in front of the focus plane and the rest, whose hidden part is filled in or given by the caller. Input in
     layers is taken as it is. Every surface is splatted (`torchbokeh.ops.splat.splat_spans`) and composed front to
     back (`torchbokeh.layers.compose`), normalised by coverage: a constant image stays constant.
+
+    A pixel that is NaN or infinite spoils its own channel of its own picture alone: the rows of its PSF, from there to
+    the right border; with motion, where something is filled in or where one convolution does it, all of it.
+
+    Gradients reach all tensors that are passed, and the numbers of lens, dispersion and aperture. At a given plan they
+    are the derivatives of what is painted, but for choices, which they take as made:
+
+    * the plan itself (which part is needed, where bins lie), which layers and pixels are not there, with an alpha of 0,
+      what counts as a highlight, and which sample of a bank stands for a motion. What is left out, a radius or a motion
+      below half a pixel and a radius that ``max_coc`` cuts get 0;
+    * where pixels are merged, their shares in two levels, and the rounding of radii to 1/64 of a cell, which is left
+      out: the gradient is that of the smooth blur that merging approximates;
+    * with ``shutter_depth``, radii come from there; ``depth`` then only says what is in front.
+
+    The backward pass draws PSFs anew: what is kept for it does not grow with them. There are no second derivatives.
 
     Args:
         lens: turns depth into signed CoC; may be left out if ``coc=`` is passed to every call.
@@ -92,7 +110,7 @@ class LensBlur(nn.Module):
             raise TypeError(f"max_coc: expected a number or None, got {max_coc!r}")
         if max_coc is not None and not max_coc > 0:
             raise ValueError(f"max_coc: expected a radius in px above 0, got {max_coc}")
-        if shutter not in ADVANCE:
+        if not isinstance(shutter, str) or shutter not in ADVANCE:
             raise ValueError(f"shutter: expected one of {', '.join(map(repr, ADVANCE))}, got {shutter!r}")
         self.lens = lens
         self.aperture = parse_aperture(aperture)
@@ -101,6 +119,8 @@ class LensBlur(nn.Module):
         self.tolerance = tolerance
         self.max_coc = max_coc
         self.subapertures = _count("subapertures", subapertures)
+        if self.subapertures is not None and self.subapertures > MOST:
+            raise ValueError(f"subapertures: expected at most {MOST}, got {subapertures}")
         self.shutter = shutter
         self.margin = margin if margin == 0 and not isinstance(margin, bool) else _whole("margin", margin)
 
@@ -166,7 +186,9 @@ class LensBlur(nn.Module):
                 The radius changes evenly in time.
             background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
                 its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
-            plan: a plan made earlier with `plan`; the scene is then not looked at again.
+            plan: a plan made earlier with `plan`; the scene is then not looked at again. A batch shares one plan, so
+                pictures and gradients depend a little on what else is in it: with the same plan for all, those of
+                several processes are those of one with the whole batch.
 
         Returns:
             ``(B, C, H, W)``; for layers ``(B, 4, H, W)``, premultiplied. Smaller by the margin, if there is one.
@@ -182,11 +204,13 @@ class LensBlur(nn.Module):
             plan = self._plan(given, cut)
         self._check_plan(plan, given)
         profile = self.aperture.profile()
+
         if self.lens is None or not plan.colours:
-            return self._cropped(self._blur(given, plan, subdivide(profile, plan.subapertures))).to(image.dtype)
+            out = self._blur(given, plan, subdivide(profile, plan.subapertures))
+            return self._cropped(_tied(out, given, plan, profile)).to(image.dtype)
 
         def blur(one: Given, own: Plan) -> Tensor:
-            return self._blur(one, own, subdivide(profile, own.subapertures))
+            return _tied(self._blur(one, own, subdivide(profile, own.subapertures)), one, own, profile)
 
         out = blur_colours(given, plan, self.lens, blur, margin=self.margin, limit=self.max_coc)
         return self._cropped(out).to(image.dtype)
@@ -233,7 +257,9 @@ class LensBlur(nn.Module):
     def _convolved(self, image: Tensor, plan: Plan, radius: float) -> Tensor:
         if not plan.moves or plan.pan is None:
             return blur_uniform(image, radius, self.aperture.profile())
-        psf = torch.from_numpy(turned_capsule(abs(radius), plan.pan, ADVANCE[self.shutter]))
+        # What lies farther away than the picture is large need not be drawn.
+        height, width = image.shape[-2:]
+        psf = torch.from_numpy(turned_capsule(abs(radius), plan.pan, ADVANCE[self.shutter], (width - 1, height - 1)))
         return blur_with(image, psf[None, None].to(image))
 
     def _over_rest(
@@ -303,7 +329,8 @@ class LensBlur(nn.Module):
         if not isinstance(plan, Plan):
             raise TypeError(f"plan: expected a Plan, got {type(plan).__name__}")
         image = given.image
-        if plan.size != tuple(image.shape[-2:]):
+        known = all(isinstance(n, int) for n in image.shape)  # an export may leave the size open
+        if known and plan.size != tuple(image.shape[-2:]):
             raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
         if plan.motion > STILL[0] and given.motion is None:
             raise ValueError("plan: expected the motion it was made with, got none")
@@ -316,9 +343,29 @@ class LensBlur(nn.Module):
             raise ValueError(f"plan: expected the background it was made with ({plan.hidden}), got another")
 
 
+def _tied(out: Tensor, given: Given, plan: Plan, profile: Profile) -> Tensor:
+    """The picture, with a gradient of 0, and not of None, to what the plan leaves out.
+
+    Among scenes that are trained on there may be one that stands still, or is sharp all over.
+    """
+    if not torch.is_grad_enabled():
+        return out
+    left_out = [] if plan.moves else [*ways(given.motion)]
+    if given.ends is not None:
+        left_out.append(given.signed if plan.approaches else given.ends)
+    if plan.sharp:
+        left_out += profile
+    if plan.layer_count and not plan.layers:
+        left_out += [given.image, given.signed]
+    for t in left_out:
+        if t.requires_grad:
+            out = out + t[None][:0].sum()  # nothing of it: not even what is infinite counts
+    return out
+
+
 def _count(name: str, value: int | str) -> int | None:
     """A positive number, or ``None`` for ``"auto"``."""
-    return None if value == "auto" else _whole(name, value, " or 'auto'")
+    return None if isinstance(value, str) and value == "auto" else _whole(name, value, " or 'auto'")
 
 
 def _whole(name: str, value: object, other: str = "") -> int:

@@ -252,9 +252,9 @@ def test_same_bits_for_any_number_of_threads(rotated: bool) -> None:
 @pytest.mark.parametrize("dtype", [F32, F64])
 def test_operators_keep_the_rules_of_torch(dtype: torch.dtype, rotated: bool, moved: bool) -> None:
     values, index, frame = scene(1, 3, 4, 5, dtype, rotated, moved)
-    points = torch.cat([table(whole=False, dtype=F64).offsets, table(dtype=F64).weights[:, None]], 1)
+    points = table(whole=False, dtype=F64)
     rotation, position = (frame[k].double() if k in frame else None for k in ("rotation", "position"))
-    args = (index, points, table().counts, rotation, position)
+    args = (index, *points, rotation, position)
     op = torch.ops.torchbokeh
     torch.library.opcheck(op.splat_points.default, (values.requires_grad_(), *args, 2, (4, 5)))
     grad = torch.rand(1, 3, 8, 9, dtype=dtype)
