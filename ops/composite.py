@@ -6,12 +6,14 @@ constant whatever the weights are, at silhouettes, between bins and at the image
 
 from collections.abc import Sequence
 from itertools import pairwise
+from numbers import Real
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_number
+from torchbokeh.ops._dispatch import only_definitions
 
 TINY = 1e-12
 """Coverage below this counts as none; far below what one pixel of a PSF of radius 1e5 covers."""
@@ -42,6 +44,10 @@ def pull_push(values: Tensor, weight: Tensor) -> Tensor:
     """
     b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("weight", weight, (b, 1, h, w), like=values)
+    return _pull_push_op(values, weight) if only_definitions() else _pull_push(values, weight)
+
+
+def _pull_push(values: Tensor, weight: Tensor) -> Tensor:
     levels = [(values * weight, weight)]
     while max(levels[-1][1].shape[-2:]) > 1:
         known, share = levels[-1]
@@ -58,6 +64,25 @@ def pull_push(values: Tensor, weight: Tensor) -> Tensor:
     return filled
 
 
+@torch.library.custom_op("torchbokeh::pull_push", mutates_args=())
+def _pull_push_op(values: Tensor, weight: Tensor) -> Tensor:
+    """What is exported as one operator, since the number of levels depends on the size; without a gradient."""
+    return _pull_push(values, weight)
+
+
+@_pull_push_op.register_fake
+def _(values: Tensor, weight: Tensor) -> Tensor:
+    return torch.empty_like(values, memory_format=torch.contiguous_format)
+
+
+def check_centres(centres: object) -> None:
+    """Raise an error unless ``centres`` are numbers, at least one."""
+    if not isinstance(centres, Sequence) or not all(isinstance(c, Real) for c in centres):
+        raise TypeError(f"centres: expected a sequence of numbers, got {centres!r}")
+    if not centres:
+        raise ValueError("centres: expected at least one, got none")
+
+
 def fill_until_full(bins: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Mix the blurred bins of one surface, front to back, until a pixel is covered.
 
@@ -70,7 +95,19 @@ def fill_until_full(bins: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tens
     Returns:
         The mean colour ``(B, C, H, W)`` and the sum of all coverages ``(B, 1, H, W)``, which varying blur may raise
         above 1.
+
+    Raises:
+        TypeError: not pairs of floating-point tensors.
+        ValueError: no bin, or shapes or devices that do not fit.
     """
+    if not isinstance(bins, Sequence) or not all(isinstance(pair, tuple) and len(pair) == 2 for pair in bins):
+        raise TypeError(f"bins: expected a sequence of pairs of tensors, got {type(bins).__name__}")
+    if not bins:
+        raise ValueError("bins: expected at least one, got none")
+    b, _, h, w = check_image("bins", bins[0][0], ("B", "C", "H", "W")).shape
+    for colour, coverage in bins:
+        check_image("bins", colour, tuple(bins[0][0].shape), like=bins[0][0])
+        check_image("bins", coverage, (b, 1, h, w), like=colour)
     mixed, total = (torch.zeros_like(t) for t in bins[0])
     taken = total
     for colour, coverage in bins:
@@ -92,7 +129,14 @@ def bin_weights(coc: Tensor, centres: Sequence[float], blend: float = 1.0) -> li
 
     Returns:
         One ``(B, 1, H, W)`` for each centre.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: a shape that does not fit, no centre, or ``blend`` out of its range.
     """
+    check_image("coc", coc, ("B", 1, "H", "W"))
+    check_centres(centres)
+    check_number("blend", blend, 1e-6, 1e6)
     if len(centres) == 1:
         return [torch.ones_like(coc)]
     spacing, last = centres[1] - centres[0], len(centres) - 1

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import MOST_PIXELS, check_flag, check_image, check_pixels, check_whole
 
 _SHAPE = ("B", "C", "H", "W")
 _NEAR = 128  # offsets below this take the integral of the Green's function, the others its expansion
@@ -138,6 +138,7 @@ def poisson_fft(b: Tensor, *, compact: bool) -> Tensor:
         True
     """
     check_image("b", b, _SHAPE)
+    check_flag("compact", compact)
     from scipy.fft import next_fast_len
 
     height, width = b.shape[-2:]
@@ -160,7 +161,7 @@ def poisson_fft(b: Tensor, *, compact: bool) -> Tensor:
     return torch.cat([solved(p) for p in planes.split(1 if one_by_one else len(planes) or 1)]).reshape(b.shape)
 
 
-def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
+def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor, levels: int | None = None) -> Tensor:
     """Invert the 5-point Laplacian approximately with a convolution pyramid (Farbman et al. 2011).
 
     Analysis: ``a_0 = b``, ``a_{l+1} = downsample2(h1 * a_l)``. Synthesis: ``u_L = -g * a_L``,
@@ -182,13 +183,16 @@ def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
             the L finest levels, of which the last stands for all that are coarser.
         h2: synthesis kernel, alike. Swapping it with ``h1`` gives the transposed operator.
         g: kernel of each level, symmetric, shape (3,), (L, 3, 3) or (L, 5, 5).
+        levels: how often the size is halved; ``None`` for one more than it takes to come down to one pixel. More
+            change little, fewer lose what is wider than ``2**levels`` px.
 
     Returns:
         Image of shape (B, C, H, W), in the dtype of ``b``.
 
     Raises:
         TypeError: ``b`` or a kernel is not a floating-point tensor.
-        ValueError: ``b`` does not have four dimensions, or a kernel has another shape or device than it should.
+        ValueError: ``b`` does not have four dimensions, a kernel has another shape or device than it should, or
+            ``levels`` is below 1.
 
     Example:
         >>> h, g = torch.tensor([0.15, 0.5, 0.7, 0.5, 0.15]), torch.tensor([0.175, 0.547, 0.175])
@@ -199,12 +203,14 @@ def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
     """
     check_image("b", b, _SHAPE)
     for name, kernel, taps in (("h1", h1, 5), ("h2", h2, 5), ("g", g, 3)):
-        levels = isinstance(kernel, Tensor) and kernel.dim() == 3
-        taps = 5 if levels and kernel.shape[-1] == 5 else taps
-        check_image(name, kernel, ("L", taps, taps) if levels else (taps,), like=b)
+        several = isinstance(kernel, Tensor) and kernel.dim() == 3
+        taps = 5 if several and kernel.shape[-1] == 5 else taps
+        check_image(name, kernel, ("L", taps, taps) if several else (taps,), like=b)
         if len(kernel) == 0:
             raise ValueError(f"{name}: expected kernels of at least one level, got shape {tuple(kernel.shape)}")
-    channels = b.shape[0] * b.shape[1]
+    if levels is not None and levels < 1:
+        raise ValueError(f"levels: expected at least 1, got {levels}")
+    channels = b.shape[1]
     dtype = torch.promote_types(b.dtype, torch.float32)
 
     def per_level(kernel: Tensor) -> Callable[[int], Tensor]:
@@ -216,19 +222,19 @@ def poisson_pyramid(b: Tensor, h1: Tensor, h2: Tensor, g: Tensor) -> Tensor:
     def filtered(x: Tensor, level: int) -> Tensor:
         return F.conv2d(x, -own(level), padding=g.shape[-1] // 2, groups=channels)
 
-    a = [b.reshape(1, channels, *b.shape[-2:]).to(dtype)]
-    # One level more than it takes to shrink the longer side to one pixel: the ones above change little.
-    count = (max(b.shape[-2:]) - 1).bit_length() + 1
-    for level in range(count):
-        # A padding of 4 keeps every coarse sample that a kernel of radius 2 reaches: even positions from -2 on.
-        a.append(F.conv2d(a[-1], analysis(level), stride=2, padding=4, groups=channels))
-    u = filtered(a.pop(), count)
-    while a:
-        fine = a.pop()
-        odd = (1 - fine.shape[-2] % 2, 1 - fine.shape[-1] % 2)
-        u = F.conv_transpose2d(u, synthesis(len(a)), stride=2, padding=4, output_padding=odd, groups=channels)
-        u = u + filtered(fine, len(a))
-    return u.reshape(b.shape).to(b.dtype)
+    a = [b.to(dtype)]
+    count = (max(b.shape[-2:]) - 1).bit_length() + 1 if levels is None else levels
+    # Convolutions are what autocast takes to half precision.
+    with torch.autocast(b.device.type, enabled=False):
+        for level in range(count):
+            # A padding of 4 keeps every coarse sample that a kernel of radius 2 reaches: even positions from -2 on.
+            a.append(F.conv2d(a[-1], analysis(level), stride=2, padding=4, groups=channels))
+        u = filtered(a.pop(), count)
+        while a:
+            fine = a.pop()
+            u = F.conv_transpose2d(u, synthesis(len(a)), stride=2, padding=4, output_padding=1, groups=channels)
+            u = u[..., : fine.shape[-2], : fine.shape[-1]] + filtered(fine, len(a))
+    return u.to(b.dtype)
 
 
 def lattice_green(height: int, width: int) -> Tensor:
@@ -254,8 +260,8 @@ def lattice_green(height: int, width: int) -> Tensor:
                 [0.2500, 0.3183]], dtype=torch.float64)
     """
     for name, n in (("height", height), ("width", width)):
-        if n < 1:
-            raise ValueError(f"{name}: expected at least 1, got {n}")
+        check_whole(name, n, 1, MOST_PIXELS)
+    check_pixels("height", height, width)
     return torch.from_numpy(_green_table(height, width))
 
 

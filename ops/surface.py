@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_image, check_kind, check_whole
 from torchbokeh.ops._dispatch import has_kernel
-from torchbokeh.ops.composite import bin_weights, fill_until_full
-from torchbokeh.ops.merge import Merging, splat_merged
-from torchbokeh.ops.spans import Profile
+from torchbokeh.ops.composite import bin_weights, check_centres, fill_until_full
+from torchbokeh.ops.merge import MOST_LEVELS, Merging, splat_merged
+from torchbokeh.ops.spans import Profile, check_profile
 
 BLEND = 0.25
 """Part of the way between two bins on which pixels belong to both: every such pixel is splatted twice."""
@@ -37,18 +38,60 @@ def blur_surface(
     Returns:
         The mean colour ``(B, C, H, W)`` and the sum of all coverages ``(B, 1, H, W)``, which varying blur may raise
         above 1. Differentiable to all tensors.
+
+    Raises:
+        TypeError: an argument of the wrong kind.
+        ValueError: shapes or devices do not fit, or ``highest`` is out of its range.
     """
+    b, _, h, w = check_image("colour", colour, ("B", "C", "H", "W")).shape
+    check_image("coc", coc, (b, 1, h, w), like=colour)
+    if weight is not None:
+        check_image("weight", weight, (b, 1, h, w), like=colour)
+    check_centres(centres)
+    check_profile(profile, colour)
+    check_kind("merging", merging, Merging)
+    check_whole("highest", highest, 0, MOST_LEVELS)
     hats = [None] if len(centres) == 1 else bin_weights(coc, centres, BLEND)
     weights = [hat if weight is None else weight if hat is None else hat * weight for hat in hats]
     asked = torch.is_grad_enabled() and any(
         t is not None and t.requires_grad for t in (colour, weight, coc, profile.knots, profile.bulge)
     )
     if has_kernel(colour) and colour.shape[1] <= 3 and colour.numel() and not asked:
-        from torchbokeh.ops import _surface_kernels
-
-        return _surface_kernels.blur_surface(colour, coc, weights, profile, merging, highest)
+        out = _blur_surface_op(colour, coc, weights, *profile, *merging, highest)
+        return out[0], out[1]
     bins = []
     for share in weights:
         splat = splat_merged(colour, coc, profile, merging, highest=highest, weight=share, ones=True)
         bins.append((splat[:, :-1], splat[:, -1:]))
     return fill_until_full(bins)
+
+
+@torch.library.custom_op("torchbokeh::blur_surface", mutates_args=())
+def _blur_surface_op(
+    colour: Tensor,
+    coc: Tensor,
+    weights: Sequence[Tensor | None],
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+) -> list[Tensor]:
+    from torchbokeh.ops import _surface_kernels
+
+    merging = Merging(cells, highlight)
+    return [*_surface_kernels.blur_surface(colour, coc, weights, Profile(knots, bulge), merging, highest)]
+
+
+@_blur_surface_op.register_fake
+def _(
+    colour: Tensor,
+    coc: Tensor,
+    weights: Sequence[Tensor | None],
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+) -> list[Tensor]:
+    return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (colour, coc)]

@@ -5,6 +5,11 @@ An image and its depth go in, the picture a lens would take comes out. `LensBlur
 
 from importlib.util import find_spec as _find_spec
 
+from torchbokeh._signals import end_while_importing as _end_while_importing
+from torchbokeh._signals import is_command as _is_command
+
+if _is_command():
+    _end_while_importing()
 if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None:
     raise ImportError(
         "torchbokeh was imported from a source folder without its parts torchbokeh.ops and torchbokeh.psfs; "
@@ -15,6 +20,7 @@ from torchbokeh import scenes
 from torchbokeh.accumulation import AccumulationBuffer
 from torchbokeh.chromatic import ChromaticAccumulation
 from torchbokeh.dispersion import Dispersion
+from torchbokeh.export import export_onnx
 from torchbokeh.field_map import FieldMap
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
 from torchbokeh.kernel_splatting import KernelSplatting, SplattingPlan
@@ -47,6 +53,7 @@ __all__ = [
     "ScanlineIntegrator",
     "SplattingPlan",
     "ThinLens",
+    "export_onnx",
     "pinhole_position",
     "reconstruct",
     "scenes",

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image
 from torchbokeh.ops.integrate import difference_x, laplacian, poisson_fft, poisson_pyramid, running_sum_x
 
 _SHAPE = ("B", "C", "H", "W")
@@ -78,6 +78,8 @@ class Integrator(nn.Module):
 class ScanlineIntegrator(Integrator):
     """Horizontal differences and their running sum along x: exact, one pass over the buffer.
 
+    A NaN or infinite value goes on to the right end of its row.
+
     Example:
         >>> scanline = ScanlineIntegrator()
         >>> u = torch.rand(1, 4, 8, 8)
@@ -95,6 +97,8 @@ class ScanlineIntegrator(Integrator):
 class FFTIntegrator(Integrator):
     """5-point Laplacian and its lattice Green's function by FFT: exact, see `torchbokeh.ops.integrate.poisson_fft`.
 
+    A NaN or infinite value spoils all of its channel.
+
     Args:
         compact: the integrated images are known to vanish on their border, so that a torus of the buffer's own
             size will do. Sparsified spreadlets break this unless their low moments vanish.
@@ -108,7 +112,7 @@ class FFTIntegrator(Integrator):
 
     def __init__(self, compact: bool = False) -> None:
         super().__init__()
-        self.compact = compact
+        self.compact = check_flag("compact", compact)
 
     def extra_repr(self) -> str:
         """Show the configuration in ``repr``."""
@@ -123,12 +127,14 @@ class PyramidIntegrator(Integrator):
 
     The kernels are parameters, with the symmetry of the square by construction: only one eighth of each is stored. By
     default they are trained ones, of their own on the finest levels and one set for all coarser ones;
-    `torchbokeh.training` trains them. It runs at any size.
+    `torchbokeh.training` trains them. It runs at any size. A NaN or infinite value spoils all of its channel.
 
     Args:
         weights: ``"trained"``, which come with the package, or ``"published"``: those of Farbman et al. 2011,
             "Convolution Pyramids", the same on every level; `torchbokeh.ops.integrate.poisson_pyramid` tells their
             error.
+        levels: how often the size is halved; ``None`` fits each picture. A fixed number makes one network for all
+            sizes, see `torchbokeh.export.export_onnx`; 13 do for 4096 px.
 
     Attributes:
         h1: analysis kernels of 5 x 5, ``(L, 6)``: at (0, 0), (0, 1), (1, 1), (0, 2), (1, 2) and (2, 2).
@@ -146,11 +152,14 @@ class PyramidIntegrator(Integrator):
         True
     """
 
-    def __init__(self, weights: str = "trained") -> None:
+    def __init__(self, weights: str = "trained", levels: int | None = None) -> None:
         super().__init__()
         if weights not in ("trained", "published"):
             raise ValueError(f"weights: expected 'trained' or 'published', got {weights!r}")
+        if levels is not None and (not isinstance(levels, int) or isinstance(levels, bool) or levels < 1):
+            raise ValueError(f"levels: expected a whole number above 0 or None, got {levels!r}")
         self.weights = weights
+        self.levels = levels
         h, g = torch.tensor([0.7, 0.5, 0.15]), torch.tensor([0.547, 0.175])
         eighths = {"h1": _eighth(h), "h2": _eighth(h), "g": _eighth(g)}
         if weights == "trained":
@@ -161,10 +170,11 @@ class PyramidIntegrator(Integrator):
 
     def extra_repr(self) -> str:
         """Show the configuration in ``repr``."""
-        return f"weights={self.weights!r}, levels={len(self.h1)}"
+        return f"weights={self.weights!r}, levels={self.levels or 'auto'}"
 
     def _integrate(self, buffer: Tensor) -> Tensor:
-        return poisson_pyramid(buffer, *(_whole(kernel) for kernel in (self.h1, self.h2, self.g)))
+        h1, h2, g = (_whole(kernel) for kernel in (self.h1, self.h2, self.g))
+        return poisson_pyramid(buffer, h1, h2, g, self.levels)
 
 
 def _places(reach: int) -> list[tuple[int, int]]:

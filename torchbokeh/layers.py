@@ -322,8 +322,24 @@ def foreground_over_rest(
     highest: int,
 ) -> Tensor:
     """`compose` of `split_foreground` in blocks for the whole lens, in few passes; CPU float32, without gradients."""
+    return _foreground_over_rest_op(image, coc, *centres, *profile, *merging, highest)
+
+
+@torch.library.custom_op("torchbokeh::foreground_over_rest", mutates_args=())
+def _foreground_over_rest_op(
+    image: Tensor,
+    coc: Tensor,
+    ahead: Sequence[float],
+    behind: Sequence[float],
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+) -> Tensor:
     from torchbokeh.ops import _foreground_kernels as kernels
 
+    profile, merging = Profile(knots, bulge), Merging(cells, highlight)
     out = torch.empty_like(image)
     for n in range(len(image)):
         scene = image[n].numpy(), coc[n, 0].numpy()
@@ -334,14 +350,29 @@ def foreground_over_rest(
         hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
         rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
         picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
-        behind, density = blur_surface(picture, None, radius, centres[1], profile, merging, highest)
+        rest_picture, density = blur_surface(picture, None, radius, behind, profile, merging, highest)
         alpha = torch.from_numpy(front)[None, None]
-        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], centres[0], profile, merging, highest)
+        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], ahead, profile, merging, highest)
         half = half_density(here, total_here, profile, merging, highest)
-        planes = (t.contiguous().numpy() for t in (half[0, 0], behind[0], density[0, 0]))
+        planes = (t.contiguous().numpy() for t in (half[0, 0], rest_picture[0], density[0, 0]))
         kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
-        out[n] = behind[0]
+        out[n] = rest_picture[0]
     return out
+
+
+@_foreground_over_rest_op.register_fake
+def _(
+    image: Tensor,
+    coc: Tensor,
+    ahead: Sequence[float],
+    behind: Sequence[float],
+    knots: Tensor,
+    bulge: Tensor,
+    cells: float,
+    highlight: float,
+    highest: int,
+) -> Tensor:
+    return torch.empty_like(image, memory_format=torch.contiguous_format)
 
 
 def compose(

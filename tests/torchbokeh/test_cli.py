@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import torchbokeh as tb
-from torchbokeh.cli import _length, main
+from torchbokeh.cli import main
+from torchbokeh.cli_scene import _length
 from torchbokeh.image_io import read_image, write_image
 
 
@@ -251,7 +252,7 @@ def test_a_message_of_several_lines_becomes_one(scene, capsys, monkeypatch):
     def fail(path):
         raise OSError("one\ntwo")
 
-    monkeypatch.setattr("torchbokeh.cli.read_image", fail)
+    monkeypatch.setattr("torchbokeh.cli_scene.read_image", fail)
     assert_refused(scene, capsys, ["render", "image.tif", *THIN, "-o", "out.png"], "torchbokeh: one two\n")
 
 
@@ -263,7 +264,7 @@ def test_interruption_and_full_gpu(scene, capsys, monkeypatch, error, status, me
     def fail(path):
         raise error
 
-    monkeypatch.setattr("torchbokeh.cli.read_image", fail)
+    monkeypatch.setattr("torchbokeh.cli_scene.read_image", fail)
     assert render(*THIN) == status
     assert capsys.readouterr().err.startswith(f"torchbokeh: {message}")
 

@@ -1,0 +1,194 @@
+"""What the operators of this package become in an exported ONNX file: standard operators only.
+
+`splat_rows` is a function of the file, a loop over the rows of the PSFs, as `torchbokeh.ops.splat` has it. Two things
+differ, since onnxruntime has no arc functions in double: the angle between the two ends of a slab is taken in float32,
+from its sine and cosine in double, so that it is exact to a relative 1e-7; and knots are found by halving.
+"""
+
+# ruff: noqa: F821 (names of sizes)
+
+import onnx
+import torch
+from onnxscript import DOUBLE, FLOAT, INT64, ir, script
+from onnxscript import opset18 as op
+from onnxscript.values import Op, Opset
+
+DOMAIN = Opset("torchbokeh", 1)
+HALF_PI = 1.5707963267948966
+LEVELS = 14
+"""Of the pyramid of `pull_push`: enough for 16384 px. From one pixel on, a further level changes nothing."""
+
+
+@script(DOMAIN)
+def splat_rows(
+    values: DOUBLE["B", "C", "H", "W"],
+    coc: DOUBLE["B", 1, "H", "W"],
+    knots: DOUBLE["K", 3],
+    bulge: DOUBLE,
+    integrals: DOUBLE["K", 2],
+    slopes: DOUBLE["S", 2],
+    whole: DOUBLE,
+    strides: INT64["T"],
+) -> DOUBLE["B", "C", "H", "W"]:
+    """`torchbokeh.ops.splat._splat_spans_torch`, before the sum along x: ``(B, C, H, W)`` in double."""
+    zero = op.CastLike(0.0, coc)
+    half = op.CastLike(0.5, coc)
+    one = op.CastLike(1.0, coc)
+    two = op.CastLike(2.0, coc)
+    tiny = op.CastLike(1e-12, coc)
+    shape = op.Shape(values)
+    channels = op.Slice(shape, [1], [2])
+    height = op.Squeeze(op.Slice(shape, [2], [3]))
+    width = op.Squeeze(op.Slice(shape, [3], [4]))
+    flat = op.Reshape(
+        op.Transpose(values, perm=[0, 2, 3, 1]), op.Concat(op.Constant(value_ints=[-1]), channels, axis=0)
+    )
+    signed = op.Reshape(coc, [-1])
+    radius = op.Where(op.Less(signed, zero), op.Neg(op.Max(op.Abs(signed), half)), op.Max(op.Abs(signed), half))
+    count = op.Size(radius)
+    where = op.Range(op.Constant(value_int=0), count, op.Constant(value_int=1))
+    y = op.Mod(op.Div(where, width), height)
+    x = op.Cast(op.Mod(where, width), to=DOUBLE.dtype) + half
+    reach = op.Min(op.Cast(op.ReduceMax(op.Abs(radius), keepdims=0), to=INT64.dtype) + 1, height - 1)
+    bottom = op.Squeeze(op.Slice(knots, [0, 0], [1, 1]))
+    top = op.Squeeze(op.Slice(knots, [-1, 0], [2147483647, 1]))
+    middle = half * (top + bottom)
+    extent = half * (top - bottom)
+    edges = op.Slice(knots, [1], [3], [1])
+    heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
+    last = op.Size(heights) - 2
+    halvings = op.Size(strides)
+    cells = op.Div(count, width) * (width + 2)
+    buffer = op.Expand(zero, op.Concat(op.Reshape(cells, [1]), channels, axis=0))
+    for k in range(2 * reach + 1):
+        row = k - reach
+        offset = op.Cast(row, to=DOUBLE.dtype)
+        target = y + row
+        inside = op.And(op.GreaterOrEqual(target, op.Constant(value_int=0)), op.Less(target, height))
+        meets = op.And(inside, op.Greater(op.Abs(radius) + one, op.Abs(offset)))
+        pixels = op.Squeeze(op.NonZero(meets), [0])
+        r = op.Gather(radius, pixels)
+        first = (offset - half) / r
+        second = (offset + half) / r
+        low = op.Max(op.Min(op.Min(first, second), top), bottom)
+        high = op.Max(op.Min(op.Max(first, second), top), bottom)
+        covered = high - low
+        safe = op.Where(op.Greater(covered, tiny), covered, one)
+        # Integrals of the left and right edge up to both ends of the slab; knots are found by halving, two need none.
+        ends = op.Concat(low, high, axis=0)
+        found = op.Cast(zero * ends, to=INT64.dtype)
+        for step in range(halvings):
+            further = op.Min(found + op.Gather(strides, step), last)
+            found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
+        beyond = op.Unsqueeze(ends - op.Gather(heights, found), [1])
+        edge = op.Gather(edges, found) + half * op.Gather(slopes, found) * beyond
+        integral = op.Gather(integrals, found) + beyond * edge
+        before, after = op.Split(integral, axis=0, num_outputs=2)
+        straight = (after - before) / op.Unsqueeze(safe, [1])
+        # Integral of sqrt(1 - u²): the angle between the ends is twice that whose tangent is sin / (1 + cos).
+        u = (low - middle) / extent
+        v = (high - middle) / extent
+        at_u = op.Sqrt(op.Max(one - u * u, zero))
+        at_v = op.Sqrt(op.Max(one - v * v, zero))
+        sine = v * at_u - u * at_v
+        cosine = u * v + at_u * at_v
+        obtuse = op.Less(cosine, zero)
+        tangent = op.Where(obtuse, one - cosine, sine) / op.Where(obtuse, op.Max(sine, tiny), one + cosine)
+        angle = two * op.Cast(op.Atan(op.Cast(tangent, to=FLOAT.dtype)), to=DOUBLE.dtype)
+        arc = half * (v * at_v - u * at_u + angle)
+        round_part = bulge * extent * arc / safe
+        left_edge = r * (op.Squeeze(op.Slice(straight, [0], [1], [1]), [1]) - round_part)
+        right_edge = r * (op.Squeeze(op.Slice(straight, [1], [2], [1]), [1]) + round_part)
+        weight = op.Where(op.Greater(covered, tiny), covered, zero) / (op.Abs(r) * whole)
+        share = op.Gather(flat, pixels) * op.Unsqueeze(weight, [1])
+        base = (op.Div(pixels, width) + row) * (width + 2)
+        here = op.Gather(x, pixels)
+        wide = op.Cast(width, to=DOUBLE.dtype)  # here: outside, onnxruntime warns that it cannot optimise it away
+        left = op.Max(op.Min(op.Min(left_edge, right_edge) + here, wide), zero)
+        right = op.Max(op.Min(op.Max(left_edge, right_edge) + here, wide), zero)
+        left_column = op.Floor(left)
+        right_column = op.Floor(right)
+        left_index = base + op.Cast(left_column, to=INT64.dtype)
+        right_index = base + op.Cast(right_column, to=INT64.dtype)
+        left_next = share * op.Unsqueeze(left - left_column, [1])
+        right_next = share * op.Unsqueeze(right - right_column, [1])
+        index = op.Concat(left_index, left_index + 1, right_index, right_index + 1, axis=0)
+        update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=0)
+        buffer = op.ScatterND(buffer, op.Unsqueeze(index, [1]), update, reduction="add")
+    padded = op.Concat(op.Slice(shape, [0], [1]), op.Reshape(height, [1]), op.Reshape(width + 2, [1]), channels, axis=0)
+    planes = op.Transpose(op.Reshape(buffer, padded), perm=[0, 3, 1, 2])
+    return op.Slice(planes, [0], op.Reshape(width, [1]), [3])
+
+
+def _schema(name, inputs):
+    formal = onnx.defs.OpSchema.FormalParameter
+    given = [formal(k, f"tensor({dtype})") for k, dtype in inputs.items()]
+    return onnx.defs.OpSchema(
+        name, DOMAIN.domain, DOMAIN.version, inputs=given, outputs=[formal("out", "tensor(double)")]
+    )
+
+
+_DOUBLES = ("values", "coc", "knots", "bulge", "integrals", "slopes", "whole")
+SPLAT_ROWS = Op(DOMAIN, "splat_rows", _schema("splat_rows", dict.fromkeys(_DOUBLES, "double") | {"strides": "int64"}))
+
+
+def splat_spans(values, coc, knots, bulge, integrate=False):
+    """Translation of the operator ``torchbokeh::splat_spans``."""
+    heights, edges = op.Slice(knots, [0], [1], [1]), op.Slice(knots, [1], [3], [1])
+    upper, lower = op.Slice(edges, [1], [2147483647], [0]), op.Slice(edges, [0], [-1], [0])
+    rise = op.Sub(op.Slice(heights, [1], [2147483647], [0]), op.Slice(heights, [0], [-1], [0]))
+    half = op.CastLike(0.5, knots)
+    zero = op.CastLike(0.0, knots)
+    pieces = op.Mul(op.Mul(half, op.Add(upper, lower)), rise)
+    integrals = op.Concat(op.Mul(zero, op.Slice(edges, [0], [1], [0])), op.CumSum(pieces, 0), axis=0)
+    flat = op.LessOrEqual(rise, op.CastLike(1e-9, knots))
+    slopes = op.Where(flat, zero, op.Div(op.Sub(upper, lower), op.Where(flat, op.CastLike(1.0, knots), rise)))
+    sides = op.Slice(integrals, [-1], [2147483647], [0])
+    straight = op.Sub(op.Slice(sides, [1], [2], [1]), op.Slice(sides, [0], [1], [1]))
+    height = op.ReduceSum(rise, keepdims=0)
+    whole = op.Add(op.Squeeze(straight), op.Mul(op.Mul(op.CastLike(HALF_PI, knots), bulge), height))
+    count = knots.shape[0]
+    halvings = [2**k for k in reversed(range((count - 2).bit_length()))]
+    strides = op.Constant(value=ir.tensor(halvings, dtype=ir.DataType.INT64))
+    out = SPLAT_ROWS(
+        op.Cast(values, to=DOUBLE.dtype), op.Cast(coc, to=DOUBLE.dtype), knots, bulge, integrals, slopes, whole, strides
+    )
+    if integrate:
+        out = op.CumSum(out, -1)
+    return op.CastLike(out, values)
+
+
+def pull_push(values, weight):
+    """Translation of the operator ``torchbokeh::pull_push``."""
+    one = op.CastLike(1.0, values)
+    tiny = op.CastLike(1e-12, values)
+    known, share, levels = op.Mul(values, weight), weight, []
+
+    def halved(x, odd):
+        return op.Mul(op.AveragePool(op.Pad(x, odd), kernel_shape=[2, 2], strides=[2, 2]), op.CastLike(4.0, x))
+
+    for _ in range(LEVELS):
+        size = op.Shape(share, start=2)
+        levels.append((known, share, size))
+        odd = op.Concat(op.Constant(value_ints=[0] * 6), op.Mod(size, 2), axis=0)
+        known, share = halved(known, odd), halved(share, odd)
+        full = op.Min(share, one)
+        known, share = op.Mul(known, op.Div(full, op.Max(share, tiny))), full
+    filled = op.Div(known, op.Max(share, tiny))
+    for known, share, size in reversed(levels):
+        scales = op.Constant(value_floats=[1.0, 1.0, 2.0, 2.0])
+        up = op.Resize(filled, None, scales, mode="linear", coordinate_transformation_mode="half_pixel")
+        up = op.Slice(up, [0, 0], size, [2, 3])
+        filled = op.Add(known, op.Mul(op.Sub(one, share), up))
+    return filled
+
+
+def translations():
+    """What each operator of this package becomes in an exported file."""
+    operators = torch.ops.torchbokeh
+    return {operators.splat_spans.default: splat_spans, operators.pull_push.default: pull_push}
+
+
+def functions():
+    """Functions of standard operators that an exported file has to hold."""
+    return [splat_rows.to_function_proto()]
