@@ -32,6 +32,18 @@ def spread(row: Row) -> str:
     return f"{seconds(row['quartile_low'])} - {seconds(row['quartile_high'])}"
 
 
+def skipped(rows: Sequence[Row]) -> str:
+    """Methods that were not run, the reasons of equal ones together."""
+    reasons: dict[str, list[str]] = {}
+    for row in rows:
+        if "skipped" in row:
+            where = f" at {row['where']}" if "where" in row else ""
+            reasons.setdefault(row["skipped"], []).append(row["method"] + where)
+    if not reasons:
+        return ""
+    return "Left out: " + "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items()) + "."
+
+
 def pictures(plots: Sequence[str], start: str) -> list[str]:
     """Those whose names begin alike."""
     return [f"![{name.removesuffix('.png').replace('_', ' ')}]({name})" for name in plots if name.startswith(start)]

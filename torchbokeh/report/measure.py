@@ -5,6 +5,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -62,24 +63,44 @@ def measure(works: Mapping[str, Work], repeat: int, budget: float = math.inf) ->
         >>> measure({"sum": torch.ones(8).sum}, repeat=3)["sum"].row["runs"]
         3
     """
-    seconds: dict[str, list[float]] = {}
     results: dict[str, Tensor] = {}
+
+    def timed(name: str, work: Work) -> tuple[float]:
+        start = time.perf_counter()
+        result = work()
+        seconds = time.perf_counter() - start
+        results.setdefault(name, result)
+        return (seconds,)
+
     with torch.inference_mode():
+        found = by_turns({name: partial(timed, name, work) for name, work in works.items()}, repeat, budget)
+    return {name: Timing(tuple(run[0] for run in found[name]), results[name]) for name in works}
+
+
+def by_turns(
+    works: Mapping[str, Callable[[], tuple[float, ...]]], repeat: int, budget: float
+) -> dict[str, list[tuple[float, ...]]]:
+    """Run several things by turns, as `measure` does, that say themselves how many seconds each of their parts took.
+
+    Args:
+        works: what to run, by name.
+        repeat: timed runs of each.
+        budget: as for `measure`, for all parts together.
+
+    Returns:
+        The seconds of the parts in each run, by name.
+    """
+    found: dict[str, list[tuple[float, ...]]] = {}
+    for name, work in works.items():
+        first = work()
+        found[name] = [first] if sum(first) > budget else []
+    for _ in range(repeat):
         for name, work in works.items():
-            start = time.perf_counter()
-            results[name] = work()
-            first = time.perf_counter() - start
-            seconds[name] = [first] if first > budget else []
-        for _ in range(repeat):
-            for name, work in works.items():
-                done = len(seconds[name])
-                spent = done >= FEWEST and sum(seconds[name]) + max(seconds[name]) > budget
-                if spent or done == repeat:
-                    continue
-                start = time.perf_counter()
-                work()
-                seconds[name].append(time.perf_counter() - start)
-    return {name: Timing(tuple(seconds[name]), results[name]) for name in works}
+            whole = [sum(parts) for parts in found[name]]
+            spent = len(whole) >= FEWEST and sum(whole) + max(whole) > budget
+            if not spent and len(whole) < repeat:
+                found[name].append(work())
+    return found
 
 
 def displayed(image: Tensor) -> np.ndarray:

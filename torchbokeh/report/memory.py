@@ -23,13 +23,14 @@ def is_known() -> bool:
     return _STATUS.exists()
 
 
-def peak_memory(method: str, size: int, radius: float) -> int | None:
+def peak_memory(method: str, size: int, radius: float, *, backward: bool = False) -> int | None:
     """Bytes that a method needs beyond its inputs for one square picture.
 
     Args:
-        method: the name of a baseline or of an operating point of this package.
+        method: the name of a baseline, of an operating point of this package, or of `gradients.gradient_methods`.
         size: side in px.
         radius: of the largest blur in px; the CoC is a ramp from minus this to this.
+        backward: of a forward pass and the backward pass to image and CoC, together; else of the picture alone.
 
     Returns:
         Bytes, or None where the system does not tell.
@@ -39,7 +40,7 @@ def peak_memory(method: str, size: int, radius: float) -> int | None:
     """
     if not is_known():
         return None
-    asked = json.dumps([method, size, radius, torch.get_num_threads()])
+    asked = json.dumps([method, size, radius, backward, torch.get_num_threads()])
     # -P: the folder that the report is started in may hold a source tree.
     command = [sys.executable, "-P", "-m", __name__, asked]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -54,20 +55,27 @@ def resident(key: str) -> int:
     return int(lines[key].split()[0]) * 1024
 
 
-def _measure(method: str, size: int, radius: float, threads: int) -> int:
+def _measure(method: str, size: int, radius: float, backward: bool, threads: int) -> int:
     from torchbokeh.report.baselines import baselines
+    from torchbokeh.report.gradients import gradient_methods
     from torchbokeh.report.methods import own_methods
 
     torch.set_num_threads(threads)
-    run = {**own_methods(), **baselines()}[method].run
-    with torch.inference_mode():
+    run = {**own_methods(), **baselines(), **gradient_methods()}[method].run
+    with torch.inference_mode(not backward):
         for side in (64, size):
             image = torch.rand(1, 3, side, side)
             ramp = torch.linspace(-radius, radius, side).expand(1, 1, side, side).contiguous()
+            grad = torch.rand(1, 3, side, side) if backward else None
+            if backward:
+                image.requires_grad_()
+                ramp.requires_grad_()
             if side == size:
                 _forget_peak()
             before = resident("VmRSS")
             out = run(image, ramp)
+            if backward:
+                out.backward(grad)
     return max(resident("VmHWM") - before, out.nbytes)
 
 

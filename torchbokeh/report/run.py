@@ -1,6 +1,7 @@
 """All experiments, one after the other, and everything that a reader of their numbers wants to know."""
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from torchbokeh.report.baselines import absent
@@ -16,6 +17,8 @@ from torchbokeh.report.experiments_blur import against_layers, against_truth, le
 from torchbokeh.report.experiments_chromatic import chromatic_bands, chromatic_samples, chromatic_truth, importance
 from torchbokeh.report.experiments_motion import like_lks, with_motion
 from torchbokeh.report.experiments_stages import stages
+from torchbokeh.report.exported import can_export, exported
+from torchbokeh.report.gradients import gradient_methods, gradients
 from torchbokeh.report.machine import machine
 from torchbokeh.report.measure import flip_is_there
 from torchbokeh.report.memory import is_known
@@ -31,6 +34,8 @@ EXPERIMENTS = {
     "pixels": against_pixels,
     "layers": against_layers,
     "threads": against_threads,
+    "gradients": gradients,
+    "export": exported,
     "motion": with_motion,
     "like_lks": like_lks,
     "chromatic_truth": chromatic_truth,
@@ -42,12 +47,13 @@ EXPERIMENTS = {
 }
 
 
-def run_experiments(settings: Settings, say: Say) -> dict[str, Any]:
-    """Run everything.
+def run_experiments(settings: Settings, say: Say, only: Sequence[str] = tuple(EXPERIMENTS)) -> dict[str, Any]:
+    """Run everything, or some of it.
 
     Args:
         settings: sizes and repetitions.
         say: is told in a line what comes next.
+        only: names of the experiments to run; the others have no rows.
 
     Returns:
         What goes into ``report.json``: ``format``, ``machine``, ``settings``, ``methods`` with their descriptions,
@@ -55,12 +61,13 @@ def run_experiments(settings: Settings, say: Say) -> dict[str, Any]:
         ``seconds``, how long it all took.
     """
     start = time.perf_counter()
-    rows = {name: experiment(settings, say) for name, experiment in EXPERIMENTS.items()}
+    rows = {name: experiment(settings, say) if name in only else [] for name, experiment in EXPERIMENTS.items()}
+    compared = {**methods(), **gradient_methods()}.values()
     return {
         "format": FORMAT,
         "machine": machine(),
         "settings": settings.row(),
-        "methods": [{"name": m.name, "family": m.family, "description": m.description} for m in methods().values()],
+        "methods": [{"name": m.name, "family": m.family, "description": m.description} for m in compared],
         "absent": _absent(),
         "experiments": rows,
         "seconds": time.perf_counter() - start,
@@ -71,6 +78,8 @@ def _absent() -> list[str]:
     lines = absent()
     if not flip_is_there():
         lines.append("FLIP: flip-evaluator is not installed (`pip install torchbokeh[report]`)")
+    if not can_export():
+        lines.append("exported files: onnx or onnxruntime is not installed (`pip install torchbokeh[export]`)")
     if not is_known():
         lines.append("peak memory: only Linux tells it")
     return lines

@@ -33,6 +33,11 @@ class Settings:
         layer_counts: of run time against layers.
         motion_size: of defocus with motion.
         motions: of that, pairs of largest radius and longest motion in px.
+        gradient_sizes: of forward and backward passes.
+        gradient_radii: likewise.
+        gradient_memory: bytes that one may take; what would take more is left out.
+        export_qualities: of the files that are exported.
+        export_sizes: at which they are run.
         chromatic_scenes: recipes of the experiments on dispersion.
         chromatic_strengths: of these, pairs of axial and lateral.
         chromatic_size: likewise.
@@ -67,6 +72,11 @@ class Settings:
     layer_counts: tuple[int, ...] = (1, 2, 4, 8, 16)
     motion_size: int = 1024
     motions: tuple[tuple[float, float], ...] = ((25.0, 40.0), (60.0, 120.0))
+    gradient_sizes: tuple[int, ...] = (256, 512, 1024)
+    gradient_radii: tuple[float, ...] = (12.0, 50.0)
+    gradient_memory: float = 6e9
+    export_qualities: tuple[str, ...] = ("exact", "balanced", "fast")
+    export_sizes: tuple[int, ...] = (256, 512)
     chromatic_scenes: tuple[str, ...] = ("coins", "ramp")
     chromatic_strengths: tuple[tuple[float, float], ...] = ((0.5, 0.0), (0.0, 0.03), (0.5, 0.03))
     chromatic_size: int = 256
@@ -108,6 +118,10 @@ def quick(scenes: tuple[str, ...] = NAMES) -> Settings:
         layer_counts=(1, 4),
         motion_size=64,
         motions=((6.0, 12.0),),
+        gradient_sizes=(48,),
+        gradient_radii=(4.0,),
+        export_qualities=(),
+        export_sizes=(48,),
         chromatic_scenes=("coins",),
         chromatic_strengths=((0.5, 0.03),),
         chromatic_size=48,

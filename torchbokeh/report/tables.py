@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from torchbokeh.report.markdown import Row, number, pictures, seconds, section, spread, table
+from torchbokeh.report.exported import export_section
+from torchbokeh.report.gradients import gradient_section
+from torchbokeh.report.markdown import Row, number, pictures, seconds, section, skipped, spread, table
 from torchbokeh.report.tables_chromatic import chromatic_sections
 
 
@@ -26,6 +28,8 @@ def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
         _pixels(rows["pixels"], plots),
         _layers(rows["layers"], plots),
         _threads(rows["threads"], settings, plots),
+        gradient_section(rows["gradients"], settings),
+        export_section(rows["export"], settings),
         _motion(rows["motion"]),
         _like_lks(rows["like_lks"], settings),
         *chromatic_sections(rows, settings, plots),
@@ -69,7 +73,7 @@ def _one_layer(rows: list[Row], plots: Sequence[str]) -> str:
     for radius in dict.fromkeys(row["radius"] for row in rows if row["scene"] == "photo"):
         chosen = [row for row in rows if row["scene"] == "photo" and row["radius"] == radius]
         parts.append(f"### photo, {chosen[0]['size']} x {chosen[0]['size']}, radius up to {radius:g} px")
-        parts += [*pictures(plots, f"one_layer_{radius:g}"), _error_table(chosen), _skipped(chosen)]
+        parts += [*pictures(plots, f"one_layer_{radius:g}"), _error_table(chosen), skipped(chosen)]
     recipes = [row for row in rows if row["scene"] != "photo"]
     if recipes:
         parts.append(
@@ -92,18 +96,6 @@ def _error_table(rows: list[Row]) -> str:
             for row in run
         ),
     )
-
-
-def _skipped(rows: list[Row]) -> str:
-    """Methods that were not run, the reasons of equal ones together."""
-    reasons: dict[str, list[str]] = {}
-    for row in rows:
-        if "skipped" in row:
-            where = f" at {row['where']}" if "where" in row else ""
-            reasons.setdefault(row["skipped"], []).append(row["method"] + where)
-    if not reasons:
-        return ""
-    return "Left out: " + "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items()) + "."
 
 
 def _recipe_table(rows: list[Row]) -> str:
@@ -179,7 +171,7 @@ def _radius(rows: list[Row], plots: Sequence[str]) -> str:
         f"photo, {rows[0]['size']} x {rows[0]['size']}; columns: largest radius in px. Seconds (SSIM):",
         *pictures(plots, "radius"),
         _by_method(rows, "radius", lambda row: f"{seconds(row['seconds'])} ({row['ssim']:.4f})"),
-        _skipped([{**row, "where": f"{row['radius']:g} px"} for row in rows]),
+        skipped([{**row, "where": f"{row['radius']:g} px"} for row in rows]),
     )
 
 
@@ -197,7 +189,7 @@ def _pixels(rows: list[Row], plots: Sequence[str]) -> str:
             "highest resident memory during the call less that before it.",
             _by_method([row for row in rows if row.get("peak_bytes")], "megapixels", _megabytes),
         ]
-    return section("Run time and memory against pixels", *parts, _skipped(rows))
+    return section("Run time and memory against pixels", *parts, skipped(rows))
 
 
 def _megabytes(row: Row) -> str:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchbokeh.report import experiments
+from torchbokeh.report import experiments, gradients
 from torchbokeh.report.run import run_experiments
 from torchbokeh.report.settings import Settings
 
@@ -25,6 +25,10 @@ TINY = Settings(
     layer_counts=(1, 3),
     motion_size=48,
     motions=((6.0, 10.0),),
+    gradient_sizes=(40,),
+    gradient_radii=(4.0,),
+    export_qualities=(),
+    export_sizes=(24, 32),
     chromatic_scenes=("coins",),
     chromatic_strengths=((0.5, 0.03),),
     chromatic_size=40,
@@ -49,6 +53,7 @@ def report():
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiments, "peak_memory", lambda name, size, radius: size * size * (40 + len(name)))
+        patch.setattr(gradients, "peak_memory", lambda name, size, radius, backward: size * size * len(name))
         found = run_experiments(TINY, lambda line: None)
     torch.set_num_threads(before)
     return found

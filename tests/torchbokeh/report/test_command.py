@@ -6,10 +6,11 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from torchbokeh.report import command, experiments
+from torchbokeh.report import command, experiments, gradients
 from torchbokeh.report import run as run_module
 from torchbokeh.report import settings as settings_module
 from torchbokeh.report.command import add_report
+from torchbokeh.report.stability import QUICK, StabilitySettings
 
 
 def run(*flags):
@@ -19,8 +20,10 @@ def run(*flags):
     args.run(args)
 
 
+@pytest.mark.slow
 def test_a_quick_report_is_written_whole(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(experiments, "peak_memory", lambda *args: None)
+    monkeypatch.setattr(gradients, "peak_memory", lambda *args, **kwargs: None)
     run("--quick", "--scenes", "photo,rain", "--out", str(tmp_path / "new"), "--threads", "1")
     said = capsys.readouterr()
     written = said.out.split()
@@ -32,19 +35,36 @@ def test_a_quick_report_is_written_whole(tmp_path, capsys, monkeypatch):
     assert "error against run time: photo" in said.err
 
 
+def test_only_some_experiments_are_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(gradients, "peak_memory", lambda *args, **kwargs: None)
+    run("--quick", "--only", "gradients", "--out", str(tmp_path))
+    found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert found["experiments"].keys() == run_module.EXPERIMENTS.keys()
+    assert [name for name, rows in found["experiments"].items() if rows] == ["gradients"]
+    headings = re.findall("^## (.*)$", (tmp_path / "report.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert headings == ["Forward and backward", "What the methods are"]
+
+
 def test_flags_choose_scenes_and_settings(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(run_module, "run_experiments", lambda settings, say: asked.append(settings))
+    monkeypatch.setattr(run_module, "run_experiments", lambda settings, say, only: asked.append((settings, only)))
     monkeypatch.setattr("torchbokeh.report.write.write_report", lambda found, folder: [])
     run("--out", str(tmp_path))
     run("--out", str(tmp_path), "--scenes", "coins, photo,coins", "--quick")
-    assert asked == [settings_module.Settings(), settings_module.quick(("coins", "photo"))]
+    run("--out", str(tmp_path), "--only", "threads,radius")
+    every = tuple(run_module.EXPERIMENTS)
+    assert asked == [
+        (settings_module.Settings(), every),
+        (settings_module.quick(("coins", "photo")), every),
+        (settings_module.Settings(), ("threads", "radius")),
+    ]
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--scenes", "photo,nowhere"], "--scenes: expected some of photo, .* got 'nowhere'"),
+        (["--only", "speed"], "--only: expected some of one_layer, .* got 'speed'"),
         (["--out", "file"], "--out file"),
     ],
 )
@@ -53,6 +73,18 @@ def test_bad_input_is_named(flags, message, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=message):
         run(*flags)
+
+
+def test_stability_is_a_chapter_of_its_own(tmp_path, monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr("torchbokeh.report.stability.run_stability", lambda settings, say: asked.append(settings))
+    monkeypatch.setattr("torchbokeh.report.stability_write.write_stability", lambda found, folder: [folder / "a.md"])
+    run("--stability", "--out", str(tmp_path))
+    run("--stability", "--quick", "--out", str(tmp_path))
+    assert asked == [StabilitySettings(), QUICK]
+    assert capsys.readouterr().out.split() == [str(tmp_path / "a.md")] * 2
+    with pytest.raises(ValueError, match="--stability: expected no --scenes"):
+        run("--stability", "--scenes", "photo", "--out", str(tmp_path))
 
 
 @pytest.mark.parametrize("flags", [["--scenes", "photo,,"], ["--threads", "0"], ["--threads", "two"]])

@@ -27,6 +27,8 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Run time and memory against pixels",
         "Run time against layers",
         "Run time against threads",
+        "Forward and backward",
+        "Exported files",
         "Defocus with motion",
         "Synthesis and reconstruction",
         "Dispersion against the truth",

@@ -1,0 +1,28 @@
+from dataclasses import replace
+
+import pytest
+
+from torchbokeh.report import exported as module
+from torchbokeh.report.exported import export_section, exported
+
+pytest.importorskip("onnxruntime")
+
+
+@pytest.mark.parametrize("qualities", [(), pytest.param(("fast",), marks=pytest.mark.slow)])
+def test_files_are_compared_at_all_sizes(tiny, qualities):
+    settings = replace(tiny, export_qualities=qualities, repeat=2)
+    rows = exported(settings, lambda line: None)
+    names = [*(f"LensBlur {name}" for name in qualities), module.PYRAMID]
+    assert [(row["method"], row["size"]) for row in rows] == [(n, s) for n in names for s in settings.export_sizes]
+    assert all(row["file_seconds"] > 0 and row["torch_seconds"] > 0 and row["kernel_seconds"] > 0 for row in rows)
+    assert all(row["error"] < 1e-4 for row in rows if row["method"] != module.PYRAMID)
+    assert all(row["error"] < 0.01 for row in rows)  # a file has the levels of the larger size
+    text = export_section(rows, settings.row())
+    assert text.startswith("## Exported files")
+    assert text.count("\n| ") == len(rows) + 2
+    assert export_section([], settings.row()) == ""
+
+
+def test_without_the_extra_there_are_no_rows(tiny, monkeypatch):
+    monkeypatch.setattr(module, "NEEDED", ("no_such_package",))
+    assert exported(tiny, lambda line: None) == []
