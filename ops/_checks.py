@@ -1,9 +1,87 @@
 """Argument checks: each error names the argument, what was expected and what came."""
 
+import math
 from collections.abc import Sequence
+from numbers import Integral, Real
 
 import torch
 from torch import Tensor
+
+MOST_PIXELS = 1 << 27
+"""Pixels of a picture, at most (134 megapixels): whoever asks for more is refused before memory is."""
+
+
+def check_pixels(name: str, height: int, width: int) -> None:
+    """Raise a ValueError for a picture of more than `MOST_PIXELS`."""
+    if height * width > MOST_PIXELS:
+        raise ValueError(f"{name}: expected at most {MOST_PIXELS} pixels, got {width} x {height}")
+
+
+def check_whole(name: str, value: object, low: int, high: int) -> int:
+    """Check a whole number from ``low`` to ``high``, and return it.
+
+    Raises:
+        TypeError: another kind of value.
+        ValueError: out of its range.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected an int, got {value!r}")
+    number = int(value)
+    if number < low:
+        raise ValueError(f"{name}: expected at least {low}, got {number}")
+    if number > high:
+        raise ValueError(f"{name}: expected at most {high}, got {number}")
+    return number
+
+
+def check_number(name: str, value: object, low: float | None = None, high: float = math.inf) -> float:
+    """As `check_whole`, for a number; NaN is out of every range. Without ``low``, only that it is one."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected a number, got {value!r}")
+    number = float(value)
+    if low is not None and not low <= number <= high:
+        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {number:g}")
+    return number
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Check that ``value`` is a bool, and return it."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: expected a bool, got {value!r}")
+    return value
+
+
+def check_kind(name: str, value: object, kind: type) -> None:
+    """Raise a TypeError unless ``value`` is a ``kind``."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+
+
+def check_size(size: Sequence[int], name: str = "size") -> tuple[int, int]:
+    """The height and the width in pixels, both at least 1.
+
+    Args:
+        size: (H, W).
+        name: of the argument, for the message.
+
+    Returns:
+        The two as ints.
+
+    Raises:
+        TypeError: not two integers.
+        ValueError: one of them is below 1, or they make up more than `MOST_PIXELS`.
+
+    Example:
+        >>> check_size([3, 5])
+        (3, 5)
+    """
+    pair = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
+    if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) for n in pair):
+        raise TypeError(f"{name}: expected two integers (H, W), got {size!r}")
+    if min(pair) < 1:
+        raise ValueError(f"{name}: expected (H, W) of at least 1, got {size!r}")
+    check_pixels(name, *pair)
+    return int(pair[0]), int(pair[1])
 
 
 def check_image(

@@ -1,13 +1,14 @@
 """One point-spread function for the whole picture: a single convolution."""
 
 import math
+from numbers import Real
 
 import torch
 from torch import Tensor
 
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.spans import Profile, working_dtype
+from torchbokeh.ops.spans import Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
 CONVOLVE_FROM = 8.0
@@ -79,6 +80,9 @@ def blur_uniform(values: Tensor, radius: float, profile: Profile) -> Tensor:
         tensor(1.)
     """
     check_image("values", values, ("B", "C", "H", "W"))
+    check_profile(profile, values)
+    if not isinstance(radius, Real) or isinstance(radius, bool):
+        raise TypeError(f"radius: expected a number, got {radius!r}")
     if not math.isfinite(radius):
         raise ValueError(f"radius: expected a finite number of px, got {radius}")
     if values.numel() == 0:
@@ -93,5 +97,7 @@ def blur_uniform(values: Tensor, radius: float, profile: Profile) -> Tensor:
 
 def blur_with(values: Tensor, psf: Tensor) -> Tensor:
     """`convolve`, divided by the coverage: arguments, result and errors are the same."""
-    coverage = convolve(torch.ones_like(values[:1, :1]), psf)
+    check_image("values", values, ("B", "C", "H", "W"))
+    check_image("psf", psf, ("B", 1, "h", "w"), like=values)
+    coverage = convolve(torch.ones_like(values[: len(psf), :1]), psf)
     return convolve(values, psf) / coverage.clamp_min(TINY)

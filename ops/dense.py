@@ -5,9 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_kind, check_whole
 from torchbokeh.ops.points import PointTable
-from torchbokeh.ops.spans import Profile, clamp_radius, row_span
+from torchbokeh.ops.spans import Profile, check_profile, clamp_radius, row_span
 
 
 def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
@@ -39,6 +39,7 @@ def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
     check_image("values", values, ("B", "C", "H", "W"))
     b, _, h, w = values.shape
     check_image("coc", coc, (b, 1, h, w), like=values)
+    check_profile(profile, values)
     values = values.double()
     radius = clamp_radius(coc.double().reshape(-1))
     profile = Profile(profile.knots.double(), profile.bulge.double())
@@ -89,7 +90,9 @@ def dense_points(
     """
     check_image("values", values, ("B", "C", "H", "W"))
     b, c, h, w = values.shape
-    check_image("index", index, (b, 1, h, w), integer=True)
+    check_image("index", index, (b, 1, h, w), like=values, integer=True)
+    check_kind("table", table, PointTable)
+    check_whole("pad", pad, 0, 1 << 12)
     out = torch.zeros(b, c, h + 2 * pad, w + 2 * pad, dtype=torch.float64)
     for n, y, x in torch.cartesian_prod(torch.arange(b), torch.arange(h), torch.arange(w)).tolist():
         psf = int(index[n, 0, y, x])

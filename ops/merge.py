@@ -29,10 +29,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image, check_kind, check_whole
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.spans import MIN_RADIUS, Profile, working_dtype
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
 FADE = 0.125
@@ -52,6 +52,9 @@ FEWEST = 16
 
 LEAST_CONTRAST = 4.0
 """A highlight is at least this many times as bright as the mean."""
+
+
+MOST_LEVELS = 32
 
 
 class Merging(NamedTuple):
@@ -123,7 +126,11 @@ def merge_cells(
         border = (0, -values.shape[3] % size, 0, -values.shape[2] % size)
 
         def total(t: Tensor, size: int = size, border: tuple[int, ...] = border) -> Tensor:
-            return F.avg_pool2d(F.pad(t, border), size) * size**2 if size > 1 else t
+            if size == 1:
+                return t
+            # torch pools no picture without channels.
+            t = F.pad(t, border)
+            return F.avg_pool2d(t, size) * size**2 if t.shape[1] else t[..., ::size, ::size]
 
         counted = share if weight is None else share * weight.detach()
         amount = total(counted).clamp_min(TINY)
@@ -233,14 +240,16 @@ def splat_merged(
     check_image("values", values, ("B", "C", "H", "W"))
     b, _, h, w = values.shape
     check_image("coc", coc, (b, 1, h, w), like=values)
-    check_image("profile.knots", profile.knots, ("K", 3), like=values)
-    check_image("profile.bulge", profile.bulge, (), like=values)
+    check_profile(profile, values)
+    check_kind("merging", merging, Merging)
+    for name, flag in (("ones", ones), ("normalise", normalise)):
+        check_flag(name, flag)
     if weight is not None:
         check_image("weight", weight, (b, 1, h, w), like=values)
     if not 0 < merging.cells < math.inf or not merging.highlight >= 0:
         raise ValueError(f"merging: expected cells above 0 and a highlight of at least 0, got {merging}")
-    if highest is not None and highest < 0:
-        raise ValueError(f"highest: expected at least 0, got {highest}")
+    if highest is not None:
+        check_whole("highest", highest, 0, MOST_LEVELS)
     if highest is None:
         largest = float(coc.detach().abs().max()) if coc.numel() else 0.0
         if not math.isfinite(largest):

@@ -5,13 +5,14 @@ defocus and bokeh dissertation. Unlike a mip-map, every level keeps the full res
 aligned to anything.
 """
 
+import sys
 from dataclasses import dataclass
 from typing import Self
 
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,8 @@ class NBuffers:
         b, _, h, w = check_image("values", values, ("B", 1, "H", "W")).shape
         if values.numel() == 0:
             raise ValueError(f"values: expected at least one pixel, got shape {tuple(values.shape)}")
-        if largest is not None and largest < 1:
-            raise ValueError(f"largest: expected at least 1, got {largest}")
+        if largest is not None:
+            check_whole("largest", largest, 1, sys.maxsize)
         if values.isnan().any():
             raise ValueError("values: expected numbers, got NaN")
         side = max(h, w) if largest is None else min(largest, max(h, w))

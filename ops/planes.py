@@ -5,6 +5,7 @@ mesh: each pixel looks up the texture of every plane it meets, sorts what it fou
 front to back. Sorting is per pixel: planes may be tilted and may cut through each other.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image, check_kind, check_size, check_whole
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
@@ -44,6 +45,10 @@ class Plates:
         cls, textures: Sequence[Tensor], mirror: Sequence[bool], infinite: Sequence[bool], count: int
     ) -> "Plates":
         """Make ``count`` levels of every texture, or as many as it takes to come down to one texel."""
+        for name, given in (("textures", textures), ("mirror", mirror), ("infinite", infinite)):
+            if not isinstance(given, Sequence) or isinstance(given, str):
+                raise TypeError(f"{name}: expected a sequence, got {type(given).__name__}")
+        check_whole("count", count, 1, sys.maxsize)
         for name, flags in (("mirror", mirror), ("infinite", infinite)):
             if len(flags) != len(textures):
                 raise ValueError(f"{name}: expected one for each of {len(textures)} textures, got {len(flags)}")
@@ -114,13 +119,16 @@ def render_planes(
         >>> render_planes(grey, view, torch.zeros(1, 1, dtype=torch.long), (3, 5))[0].shape
         torch.Size([1, 4, 3, 5])
     """
+    check_kind("plates", plates, Plates)
+    check_size(size)
+    check_flag("frames", frames)
     count = len(plates.levels)
     check_image("inverse", inverse, ("V", count, 3, 3))
     if len(inverse) == 0:
         raise ValueError("inverse: expected at least one view, got none")
-    check_image("level", level, (len(inverse), count), integer=True)
+    check_image("level", level, (len(inverse), count), like=inverse, integer=True)
     if parents is not None:
-        check_image("parents", parents, tuple(level.shape), integer=True)
+        check_image("parents", parents, tuple(level.shape), like=inverse, integer=True)
         if parents.numel() and not 0 <= int(parents.min()) <= int(parents.max()) < len(level):
             raise ValueError(f"parents: expected indices of {len(level)} views, got {parents.min()} to {parents.max()}")
         inverse = inverse.gather(0, parents[..., None, None].expand_as(inverse))

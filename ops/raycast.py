@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_image, check_number, check_whole
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.nbuffers import NBuffers
 from torchbokeh.ops.spans import working_dtype
@@ -77,11 +77,10 @@ def subsample_blur(
         check_image("background", background, (b, c, h, w), like=colour)
     if not offsets.isfinite().all():
         raise ValueError("offsets: expected finite numbers, got others")
-    if math.isnan(far):
+    check_whole("iterations", iterations, 0, 100)
+    if math.isnan(check_number("far", far)):
         raise ValueError("far: expected a number, got nan")
-    if iterations < 0:
-        raise ValueError(f"iterations: expected at least 0, got {iterations}")
-    if not tolerance >= 0:
+    if not check_number("tolerance", tolerance) >= 0:
         raise ValueError(f"tolerance: expected at least 0 px, got {tolerance}")
     if colour.numel() == 0:
         return colour.clone()

@@ -3,7 +3,11 @@
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.spans import Profile, edges_at
+from torchbokeh.ops._checks import check_image, check_whole
+from torchbokeh.ops.spans import Profile, check_profile, edges_at
+
+MOST = 1 << 24
+"""Points of a run of `halton`, and index of its first one, at most."""
 
 DIMENSIONS = 6
 """Columns of `halton`: bases 2, 3, 5, 7, 11, 13."""
@@ -24,15 +28,17 @@ def halton(count: int, *, first: int = 0, seed: int | None = None) -> Tensor:
         ``(count, 6)`` in [0, 1), double.
 
     Raises:
-        ValueError: a negative number.
+        TypeError: not an int.
+        ValueError: a number out of its range.
 
     Example:
         >>> halton(2)[:, 0].tolist()
         [0.5, 0.25]
     """
-    for name, value in (("count", count), ("first", first), ("seed", seed or 0)):
-        if value < 0:
-            raise ValueError(f"{name}: expected 0 or more, got {value}")
+    check_whole("count", count, 0, MOST)
+    check_whole("first", first, 0, MOST)  # SciPy makes all that come before
+    if seed is not None:
+        check_whole("seed", seed, 0, (1 << 62) - 1)
     if count == 0:
         return torch.zeros(0, DIMENSIONS, dtype=torch.float64)
     from scipy.stats import qmc
@@ -59,6 +65,7 @@ def aperture_points(profile: Profile, square: Tensor) -> Tensor:
         ``(N, 2)`` points (x, y) in units of the aperture radius, in the dtype of the profile.
 
     Raises:
+        TypeError: ``profile`` is no `Profile`, or ``square`` not a floating-point tensor.
         ValueError: ``square`` is not of shape ``(N, 2)``.
 
     Example:
@@ -67,8 +74,8 @@ def aperture_points(profile: Profile, square: Tensor) -> Tensor:
         >>> aperture_points(Disc().profile(), torch.tensor([[0.25, 0.0]])).tolist()
         [[0.5, 0.0]]
     """
-    if square.dim() != 2 or square.shape[1] != 2:
-        raise ValueError(f"square: expected shape (N, 2), got {tuple(square.shape)}")
+    check_profile(profile)
+    check_image("square", square, ("N", 2))
     u, v = square.to(profile.knots).unbind(1)
     bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
     if len(profile.knots) == 2 and bool((profile.knots[:, 1] == profile.knots[:, 2]).all()):
@@ -96,5 +103,6 @@ def stratified(points: Tensor) -> Tensor:
         >>> stratified(torch.tensor([0.9, 0.1])).tolist()
         [0.75, 0.25]
     """
+    check_image("points", points, ("N",))
     rank = points.argsort(stable=True).argsort(stable=True)
     return (rank.to(points.dtype) + 0.5) / max(len(points), 1)

@@ -7,6 +7,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_kind
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 310.0, 2300.0
@@ -85,6 +86,7 @@ def refractive_index(glass: str, wavelength: float | Tensor) -> float | Tensor:
         >>> round(refractive_index("BK7", 587.5618), 5)
         1.5168
     """
+    check_kind("glass", glass, str)
     if glass not in SELLMEIER:
         raise ValueError(f"glass: expected one of {', '.join(SELLMEIER)}, got {glass!r}")
     terms = tuple(zip(*SELLMEIER[glass], strict=True))

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_image, check_kind, check_whole
+
 MIN_RADIUS = 0.5
 """Below this radius (px) a PSF lies within its own pixel: the splat is the identity."""
 
@@ -36,6 +38,13 @@ class Profile(NamedTuple):
 def working_dtype(device: torch.device) -> torch.dtype:
     """The dtype of geometry and running sums: double, where the device has it."""
     return torch.float32 if device.type == "mps" else torch.float64
+
+
+def check_profile(profile: Profile, like: Tensor | None = None) -> None:
+    """Raise an error unless ``profile`` is one, on the device of ``like``."""
+    check_kind("profile", profile, Profile)
+    check_image("profile.knots", profile.knots, ("K", 3), like=like)
+    check_image("profile.bulge", profile.bulge, (), like=like)
 
 
 class _Semicircle(torch.autograd.Function):
@@ -149,10 +158,12 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
         The pieces, row by row. Their area is ``area(profile) / side**2`` to within 0.04 %.
 
     Raises:
-        ValueError: ``side`` is not positive.
+        TypeError: an argument of the wrong kind.
+        ValueError: ``side`` or ``samples`` is out of its range.
     """
-    if side < 1:
-        raise ValueError(f"side: expected at least 1, got {side}")
+    check_profile(profile)
+    check_whole("side", side, 1, 256)
+    check_whole("samples", samples, 2, 1 << 16)
     if side == 1:
         return [profile]
     bottom, top = profile.knots[0, 0], profile.knots[-1, 0]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops import _cie_1931
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 380.0, 780.0
@@ -125,6 +125,7 @@ def spectral_samples(
         ([430.0, 530.0, 630.0, 730.0], [1.0, 1.0, 1.0])
     """
     check_image("unit", unit, ["N"])
+    check_flag("importance", importance)
     wrong = unit[~((unit >= 0) & (unit < 1))]
     if len(wrong) > 0:
         raise ValueError(f"unit: expected points in [0, 1), got {wrong[0].item():g}")
@@ -268,6 +269,8 @@ def _weights(weight: Weight, wavelength: Tensor) -> Tensor:
     """The equaliser at ``(N,)`` wavelengths, checked."""
     if weight is None:
         return torch.ones_like(wavelength)
+    if not callable(weight):
+        raise TypeError(f"weight: expected a function of a tensor, got {type(weight).__name__}")
     values = weight(wavelength)
     if not isinstance(values, Tensor):
         raise TypeError(f"weight: expected a function that gives a tensor, got {type(values).__name__}")

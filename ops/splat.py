@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops._checks import check_flag, check_image
 from torchbokeh.ops._dispatch import compute_dtype, has_kernel
 from torchbokeh.ops._span_gradient import row_span_gradient
 from torchbokeh.ops.points import PointTable, splat_points
-from torchbokeh.ops.spans import MIN_RADIUS, Profile, clamp_radius, row_span, working_dtype
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, row_span, working_dtype
 
 __all__ = ["PointTable", "splat_points", "splat_spans"]
 
@@ -59,8 +59,8 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     check_image("values", values, ("B", "C", "H", "W"))
     b, _, h, w = values.shape
     check_image("coc", coc, (b, 1, h, w), like=values)
-    check_image("profile.knots", profile.knots, ("K", 3), like=values)
-    check_image("profile.bulge", profile.bulge, (), like=values)
+    check_profile(profile, values)
+    check_flag("integrate", integrate)
     dtype = compute_dtype(values, coc)
     work = working_dtype(values.device)
     source, radius = values.to(dtype), coc.to(dtype)

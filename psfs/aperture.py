@@ -10,6 +10,7 @@ import re
 import torch
 from torch import Tensor, nn
 
+from torchbokeh.ops._checks import check_image, check_number
 from torchbokeh.ops.spans import Profile
 
 CHORDS = 16
@@ -18,7 +19,9 @@ CHORDS = 16
 
 def _setting(module: nn.Module, name: str, value: float | Tensor, low: float, high: float) -> None:
     """Keep an ``nn.Parameter`` as it is and make anything else a buffer, after a check of its range."""
-    tensor = torch.as_tensor(value)
+    tensor = value if isinstance(value, Tensor) else torch.tensor(check_number(name, value, low, high))
+    if not tensor.is_floating_point():
+        raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}")
     if tensor.dim() != 0:
         raise ValueError(f"{name}: expected one number, got shape {tuple(tensor.shape)}")
     if not low <= tensor.item() <= high:
@@ -176,9 +179,11 @@ def polygon_profile(vertices: Tensor) -> Profile:
         The `Profile`, differentiable to the corners.
 
     Raises:
+        TypeError: ``vertices`` is not a floating-point tensor.
         ValueError: not ``(V, 2)`` with V >= 3, or the corners do not turn one way all around.
     """
-    if vertices.dim() != 2 or vertices.shape[1] != 2 or len(vertices) < 3:
+    check_image("vertices", vertices, ("V", 2))
+    if len(vertices) < 3:
         raise ValueError(f"vertices: expected shape (V, 2) with V >= 3, got {tuple(vertices.shape)}")
     edges = vertices.roll(-1, 0) - vertices
     following = edges.roll(-1, 0)

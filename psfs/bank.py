@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchbokeh.ops._files import replacing
 from torchbokeh.ops.points import PointTable
-from torchbokeh.psfs.model import PsfModel
+from torchbokeh.psfs.model import FRAME, PsfModel
 from torchbokeh.psfs.models import MODELS, model_from
+from torchbokeh.psfs.refit import Sparse, drawn, reconstruction
 from torchbokeh.psfs.represent import DOMAINS, Domain, Represented
 
 FORMAT, VERSION = "torchbokeh-psf-bank", 1
@@ -24,6 +25,15 @@ BANKS = Path(__file__).parent / "banks"
 
 LARGEST_FILE = 64 << 20
 """Bytes of a file of a bank, at most: what is larger is refused before it is read."""
+
+FARTHEST = FRAME // 2 + 1
+"""Px of a point from the centre of its sample, along x or y, at most: the Laplacian goes one beyond a dense PSF."""
+
+FAINT = 3e-3
+"""Of its maximum: what a drawn sample holds below this are the ripples of its points."""
+
+KEPT = 64
+"""Samples that are kept as drawn, at most: they take up to 2 MB each."""
 
 _DTYPES = {"offsets": torch.int16, "values": torch.float32, "counts": torch.int32, "domains": torch.uint8}
 
@@ -43,6 +53,7 @@ class PsfBank(nn.Module):
         domains: ``(K,)`` uint8, indices into `torchbokeh.psfs.represent.DOMAINS`.
 
     Raises:
+        TypeError: an argument of the wrong kind.
         ValueError: the number of samples is not that of the grid.
 
     Example:
@@ -58,11 +69,18 @@ class PsfBank(nn.Module):
 
     def __init__(self, model: PsfModel, samples: Sequence[Represented], info: dict[str, Any] | None = None) -> None:
         super().__init__()
+        if not isinstance(model, PsfModel):
+            raise TypeError(f"model: expected a PsfModel, got {type(model).__name__}")
+        if not isinstance(samples, Sequence) or not all(isinstance(s, Represented) for s in samples):
+            raise TypeError(f"samples: expected a sequence of Represented, got {type(samples).__name__}")
+        if info is not None and not isinstance(info, dict):
+            raise TypeError(f"info: expected a dict or None, got {type(info).__name__}")
         if len(samples) != len(model.grid):
             raise ValueError(f"samples: expected {len(model.grid)} for {model.name}, got {len(samples)}")
         self.model = model
         self.info = dict(info or {})
         self._tables: dict[tuple[Domain, int, torch.device], PointTable] = {}
+        self._pictures: dict[int, NDArray[np.float64]] = {}
         sizes = [len(s.sparse.points) for s in samples]
         self.register_buffer("offsets", torch.from_numpy(np.concatenate([s.sparse.points for s in samples])).short())
         self.register_buffer("values", torch.from_numpy(np.concatenate([s.sparse.values for s in samples])).float())
@@ -79,8 +97,6 @@ class PsfBank(nn.Module):
 
     def sample(self, number: int) -> Represented:
         """One sample as it was built, its values rounded to float32."""
-        from torchbokeh.psfs.refit import Sparse
-
         first, last = self.counts[number : number + 2].tolist()
         points = self.offsets[first:last].cpu().numpy().astype(np.int64)
         return Represented(
@@ -101,6 +117,49 @@ class PsfBank(nn.Module):
                 counts = torch.cat([sizes.new_zeros(1), torch.where(here, sizes, 0).cumsum(0)]).long()
                 self._tables[key] = PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts)
         return self._tables[key]
+
+    def dense(self, used: Tensor, fine: int = 1) -> "PsfBank":
+        """The samples pixel by pixel, in the domain ``direct``, with nothing beyond their points: for bright pixels.
+
+        Args:
+            used: ``(K,)`` bool; the other samples are left without points.
+            fine: points along each side of a pixel, for PSFs that are turned or enlarged.
+        """
+        offsets, values, sizes = [np.zeros((0, 2))], [np.zeros((0, self.values.shape[1]))], np.zeros(len(self), int)
+        steps = (np.arange(fine) + 0.5) / fine - 0.5
+        for number in used.nonzero()[:, 0].tolist():
+            picture = self._picture(number)
+            y, x = np.nonzero((picture > 0).any(0))
+            place = np.stack([x - picture.shape[2] // 2, y - picture.shape[1] // 2], 1)
+            offsets += [place + np.array([dx, dy]) for dy in steps for dx in steps]
+            values += [picture[:, y, x].T / fine**2] * fine**2
+            sizes[number] = len(place) * fine**2
+        bank = PsfBank.__new__(PsfBank)
+        nn.Module.__init__(bank)
+        bank.model, bank.info, bank._tables, bank._pictures = self.model, self.info, {}, {}
+        with torch.inference_mode(False):
+            bank.register_buffer("offsets", torch.from_numpy(np.concatenate(offsets)).float())
+            bank.register_buffer("values", torch.from_numpy(np.concatenate(values)).float())
+            bank.register_buffer("counts", torch.tensor([0, *np.cumsum(sizes)], dtype=torch.int32))
+            bank.register_buffer("domains", torch.zeros(len(self), dtype=torch.uint8))
+        return bank.to(self.values.device)
+
+    def _picture(self, number: int) -> NDArray[np.float64]:
+        """What the points of a sample integrate to, within their reach: ``(C, h, w)``, centred, >= 0."""
+        found = self._pictures.get(number)
+        if found is None:
+            domain, sparse = self.sample(number)
+            side = 2 * int(np.abs(sparse.points).max(initial=0)) + 1
+            found = reconstruction(sparse, (side, side)) if domain == "laplacian" else drawn(sparse, (side // 2,) * 2)
+            found = found.cumsum(2) if domain == "scanline" else found
+            # What a sparse PSF has there beside its light are ripples.
+            found = np.where(found > FAINT * found.max(initial=0.0), found, 0.0)
+            gain = self.gains()[number].cpu().double().numpy()[:, None, None]
+            sums = found.sum((1, 2), keepdims=True)
+            found = found * np.divide(gain, sums, out=np.zeros_like(sums), where=sums > 0)
+            if len(self._pictures) < KEPT:
+                self._pictures[number] = found
+        return found
 
     def reach(self) -> Tensor:
         """Largest distance ``(K,)`` in px of a point of each sample from its centre, along x or y."""
@@ -148,16 +207,8 @@ class PsfBank(nn.Module):
             "digest": _digest(tensors),
         }
         content = save(tensors, {"torchbokeh": json.dumps(head, sort_keys=True)})
-        path = Path(path)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            os.chmod(temporary, 0o666 & ~_umask())
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
 
     @classmethod
     def load(cls, source: str | Path, model: PsfModel | None = None) -> "PsfBank":
@@ -169,8 +220,13 @@ class PsfBank(nn.Module):
 
         Raises:
             FileNotFoundError: there is no such file, and no model of that name.
+            TypeError: an argument of the wrong kind.
             ValueError: the file is no bank, was cut or changed, or belongs to another version.
         """
+        if not isinstance(source, str | Path):
+            raise TypeError(f"source: expected a file or the name of a model, got {type(source).__name__}")
+        if model is not None and not isinstance(model, PsfModel):
+            raise TypeError(f"model: expected a PsfModel or None, got {type(model).__name__}")
         path = BANKS / f"{source}.safetensors" if source in MODELS else Path(source)
         if not path.is_file():
             raise FileNotFoundError(
@@ -178,14 +234,19 @@ class PsfBank(nn.Module):
             )
         head, tensors = _read(path)
         if model is None:
-            model = model_from(head["model"], head["settings"])
+            try:
+                model = model_from(head["model"], head["settings"])
+            except ValueError as error:
+                raise ValueError(f"{path}: expected a model of this version ({error})") from error
         elif model.name != head["model"]:
             raise ValueError(f"model: expected {head['model']!r}, whose bank {path} is, got {model.name!r}")
         if _grid_of(model) != head["grid"]:
             raise ValueError(f"{path}: its samples stand elsewhere than those of this version's model {model.name!r}")
+        if (len(tensors["domains"]), tensors["values"].shape[1]) != (len(model.grid), model.channels):
+            raise ValueError(f"{path}: expected {len(model.grid)} samples of {model.channels} channels, got others")
         bank = cls.__new__(cls)
         nn.Module.__init__(bank)
-        bank.model, bank.info, bank._tables = model, head["info"], {}
+        bank.model, bank.info, bank._tables, bank._pictures = model, head["info"], {}, {}
         for name, tensor in tensors.items():
             bank.register_buffer(name, tensor)
         return bank
@@ -199,12 +260,6 @@ def installed() -> list[str]:
 def _grid_of(model: PsfModel) -> list[list[float]]:
     grid = model.grid
     return [list(grid.bounds), list(grid.betas), list(grid.cells)]
-
-
-def _umask() -> int:
-    now = os.umask(0)
-    os.umask(now)
-    return now
 
 
 def _digest(tensors: dict[str, Tensor]) -> str:
@@ -232,7 +287,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         head = json.loads(text)
         version = head["version"] if head["format"] == FORMAT else None
-    except (ValueError, KeyError, TypeError) as error:
+        kinds = (("model", str), ("settings", dict), ("grid", list), ("info", dict))
+        if version == VERSION and not all(isinstance(head[name], kind) for name, kind in kinds):
+            raise TypeError("an entry of another kind")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: expected a bank of PSFs, but its header cannot be read ({error})") from error
     if version != VERSION:
         raise ValueError(f"{path}: expected a bank of PSFs of version {VERSION}, got version {version}")
@@ -257,6 +315,7 @@ def _check(path: Path, head: dict[str, Any], tensors: dict[str, Tensor]) -> None
         and int(counts[-1]) == len(values)
         and bool((counts.diff() >= 0).all())
         and bool((domains < len(DOMAINS)).all())
+        and bool(((offsets >= -FARTHEST) & (offsets <= FARTHEST)).all())
         and bool(values.isfinite().all())
     )
     if not fits:

@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel, gaussian, mean_picture, scaled, turned
+from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, gaussian, mean_picture, scaled, turned
 
 NODES = 5
 """Radii, and lengths, whose mean stands for a box of the grid."""
@@ -62,31 +63,42 @@ def capsule(radius: float, length: float) -> NDArray[np.float64]:
     return whole / whole.sum()  # pi r**2, but for 1e-7 of the quadrature
 
 
-def turned_capsule(radius: float, motion: tuple[float, float], advance: float = 0.0) -> NDArray[np.float64]:
+def turned_capsule(
+    radius: float, motion: tuple[float, float], advance: float = 0.0, limit: tuple[int, int] | None = None
+) -> NDArray[np.float64]:
     """A disc, spread along a displacement in any direction, by samples in each pixel: ``(h, w)``, with a sum of 1.
 
     Args:
         radius: of the disc in px, >= 0; below half a pixel it is half a pixel.
         motion: (dx, dy) in px.
         advance: by which part of the motion its middle lies ahead of the middle of the picture.
+        limit: how far along x and y it is drawn at most; the sum is that of what is drawn.
     """
     radius = max(radius, MIN_RADIUS)
     half = math.hypot(*motion) / 2
     cos, sin = (motion[0] / (2 * half), motion[1] / (2 * half)) if half > 0 else (1.0, 0.0)
     reach = [math.ceil(radius + (0.5 + abs(advance)) * abs(d)) + 1 for d in motion]
+    if limit is not None:
+        reach = [min(r, most) for r, most in zip(reach, limit, strict=True)]
     fine = int(np.clip(24 / radius, *FINE)) | 1
-    x, y = (
-        np.arange(-r * fine - fine // 2, r * fine + fine // 2 + 1) / fine - advance * d
-        for r, d in zip(reach, motion, strict=True)
-    )
-    along, across = x * cos + y[:, None] * sin, y[:, None] * cos - x * sin
-    chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
-    if half < 1e-3:
-        light = (np.abs(along) <= chord) & (chord > 0)
-    else:
-        light = np.maximum(np.minimum(along + half, chord) - np.maximum(along - half, -chord), 0.0)
-    pixels = light.reshape(2 * reach[1] + 1, fine, 2 * reach[0] + 1, fine).sum((1, 3), dtype=np.float64)
-    return pixels / pixels.sum()
+    steps = (np.arange(fine) - fine // 2) / fine
+    pixels = np.zeros((2 * reach[1] + 1, 2 * reach[0] + 1))
+    for row, line in enumerate(pixels):
+        v = row - reach[1] - advance * motion[1]
+        # A long way crosses few pixels of a row.
+        width = (radius + 1) / max(abs(sin), 1e-9)
+        middle = advance * motion[0] + v * cos / (sin or 1e-9) + reach[0]
+        first, last = (int(np.clip(end, 0, len(line))) for end in (middle - width - 1, middle + width + 2))
+        x = (np.arange(first, last)[:, None] + steps).ravel() - reach[0] - advance * motion[0]
+        y = v + steps[:, None]
+        along, across = x * cos + y * sin, y * cos - x * sin
+        chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+        if half < 1e-3:
+            light = ((np.abs(along) <= chord) & (chord > 0)).astype(np.float64)
+        else:
+            light = np.maximum(np.minimum(along + half, chord) - np.maximum(along - half, -chord), 0.0)
+        line[first:last] = light.reshape(fine, -1, fine).sum((0, 2))
+    return pixels / max(pixels.sum(), np.finfo(np.float64).tiny)
 
 
 def _running(x: NDArray[np.float64], chord: NDArray[np.float64], half: float) -> NDArray[np.float64]:
@@ -111,7 +123,11 @@ class Combined(PsfModel):
 
     Args:
         radius: largest radius that is sampled.
-        length: longest motion that is sampled.
+        length: longest motion that is sampled. Both are at least 1, and the PSF of both fits into `FRAME`.
+
+    Raises:
+        TypeError: not a number.
+        ValueError: out of its range.
 
     Example:
         >>> model = Combined()
@@ -125,6 +141,8 @@ class Combined(PsfModel):
     turns = True
 
     def __init__(self, radius: float = 100.0, length: float = 256.0) -> None:
+        radius = check_number("radius", radius, 1, FRAME / 2 - 1)
+        length = check_number("length", length, 1, FRAME - 2 * radius)
         self.axes = (
             Axis("radius", "px", radius - MIN_RADIUS, 2.0, CELLS),
             Axis("motion length", "px", length, 1.0, CELLS),

@@ -52,12 +52,22 @@ class Labels(NamedTuple):
         depth: ``(B, 1, H, W)`` metres along the optical axis.
         motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter.
         offset: ``(B, 2, H, W)`` of the centre of the PSF from the pixel, (dx, dy) in px. Models do not look at it.
+        field: ``(B, 2, H, W)``, see `field_of`; None where the maps are those of the whole picture.
     """
 
     coc: Tensor | None = None
     depth: Tensor | None = None
     motion: Tensor | None = None
     offset: Tensor | None = None
+    field: Tensor | None = None
+
+
+def field_of(like: Tensor) -> Tensor:
+    """Where in a picture ``(B, ..., H, W)`` its pixels are: x and y from its middle over half its longer side."""
+    height, width = like.shape[-2:]
+    x, y = (torch.arange(n, dtype=like.dtype, device=like.device) - (n - 1) / 2 for n in (width, height))
+    place = torch.stack(torch.broadcast_tensors(x, y[:, None])) * (2 / max(height, width))
+    return place.expand(len(like), -1, -1, -1)
 
 
 class Place(NamedTuple):
@@ -89,6 +99,7 @@ class PsfModel(ABC):
         symmetry: of every dense PSF.
         turns: whether a renderer turns the PSF, so that only rotation-invariant domains will do.
         merges: whether the PSF is smooth over a part of the CoC radius, so that pixels may be merged by that radius.
+        fields: whether the PSF depends on the place in the picture.
         tints: whether channels of the PSF do not sum to 1 and are meant not to: white then comes out coloured.
         similarity: what a bank of it is built to, see `torchbokeh.psfs.represent.Target`.
     """
@@ -99,6 +110,7 @@ class PsfModel(ABC):
     symmetry: ClassVar[Symmetry] = "none"
     turns: ClassVar[bool] = False
     merges: ClassVar[bool] = True
+    fields: ClassVar[bool] = False
     tints: ClassVar[bool] = False
     similarity: ClassVar[float] = 0.97
 

@@ -25,5 +25,5 @@ def model_from(name: str, settings: dict[str, Any] | None = None) -> PsfModel:
         raise ValueError(f"name: expected one of {', '.join(sorted(MODELS))}, got {name!r}")
     try:
         return MODELS[name](**(settings or {}))
-    except TypeError as error:
+    except (TypeError, OverflowError) as error:
         raise ValueError(f"settings: expected those of {name}, got {settings} ({error})") from error

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchbokeh.ops._checks import check_number
 from torchbokeh.ops.sellmeier import refractive_index
-from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, scaled, turned
+from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
 from torchbokeh.psfs.tracing import cropped, splat_rays, spread
 
 Array = NDArray[np.float64]
@@ -155,6 +156,7 @@ class PhysicalLens(PsfModel):
             The bound must be at most a quarter of `FRAME`.
 
     Raises:
+        TypeError: an argument is not a number.
         ValueError: an argument is out of range.
 
     Source:
@@ -173,6 +175,7 @@ class PhysicalLens(PsfModel):
     similarity = 0.985
     symmetry = "mirror"
     turns = True
+    fields = True
 
     def __init__(
         self,
@@ -183,12 +186,13 @@ class PhysicalLens(PsfModel):
         sensor_width: float = 0.036,
         width: int = 1024,
     ) -> None:
-        if side not in ("behind", "front"):
+        if not isinstance(side, str) or side not in ("behind", "front"):
             raise ValueError(f"side: expected 'behind' or 'front', got {side!r}")
         lens = {"focal_length": focal_length, "f_number": f_number, "focus_distance": focus_distance}
         sensor = {"sensor_width": sensor_width, "width": width}
-        lowest = {"f_number": 1.0, "focus_distance": 2 * focal_length}
+        lowest = {"f_number": 1.0, "focus_distance": 2 * check_number("focal_length", focal_length)}
         for name, value in (lens | sensor).items():
+            check_number(name, value)
             if not lowest.get(name, 0.0) < value < math.inf:
                 raise ValueError(f"{name}: expected a finite number above {lowest.get(name, 0.0):g}, got {value}")
         if sensor_width > focal_length:
@@ -228,13 +232,11 @@ class PhysicalLens(PsfModel):
         if labels.coc is None:
             raise ValueError(f"{self.name}: expected coc, got none")
         coc = (labels.coc * self._sign).clamp_min(0.0)
-        height, width = coc.shape[-2:]
-        x, y = (torch.arange(n, dtype=coc.dtype, device=coc.device) - (n - 1) / 2 for n in (width, height))
-        outwards = torch.stack(torch.broadcast_tensors(x, y[:, None]))[None].expand(len(coc), -1, -1, -1)
-        eccentricity = outwards.square().sum(1, keepdim=True).sqrt() * (math.sqrt(2) / max(height, width))
+        field = field_of(coc) if labels.field is None else labels.field
+        eccentricity = field.square().sum(1, keepdim=True).sqrt() / math.sqrt(2)
         # What is more blurred than the lens can is scaled from its largest.
         scale = (coc.detach() / self.axes[0].bound).clamp_min(1.0)
-        return scaled(Place(torch.cat([coc / scale, eccentricity], 1), turned(outwards)), scale)
+        return scaled(Place(torch.cat([coc / scale, eccentricity], 1), turned(field)), scale)
 
     def _traced(self, places: Sequence[Sequence[float]]) -> Array:
         """The mean of PSFs. Each gets a part of Sobol's sequence, which fills the stop by itself."""

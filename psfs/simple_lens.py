@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchbokeh.ops._checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.combined import capsule, of_radius
-from torchbokeh.psfs.model import Axis, Labels, Place, PsfModel
+from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 
 
 class RadiusModel(PsfModel):
@@ -31,7 +32,11 @@ class SimpleLens(RadiusModel):
     there for comparison with LKS. Larger discs are scaled from the largest.
 
     Args:
-        radius: largest radius that is sampled, in px.
+        radius: largest radius that is sampled, in px: from 1 to half of `FRAME`.
+
+    Raises:
+        TypeError: not a number.
+        ValueError: out of its range.
 
     Example:
         >>> psf = SimpleLens().dense((9.5,))
@@ -43,6 +48,7 @@ class SimpleLens(RadiusModel):
     symmetry = "octants"
 
     def __init__(self, radius: float = 100.0) -> None:
+        radius = check_number("radius", radius, 1, FRAME / 2)
         self.axes = (Axis("radius", "px", radius - MIN_RADIUS, 2.0, 100 * 101 // 2),)
 
     def settings(self) -> dict[str, float | int | str]:

@@ -1,7 +1,6 @@
 """`Stylized`: any picture as the shape of defocus, with coloured fringes (LKS table 1)."""
 
 import base64
-import binascii
 import io
 import math
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchbokeh.ops._checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.model import Axis
 from torchbokeh.psfs.simple_lens import RadiusModel
@@ -63,7 +63,7 @@ def decoded(text: str) -> Mask:
             if max(image.size) > LARGEST:
                 raise ValueError(f"mask: expected at most {LARGEST} px along each side, got {image.size}")
             return np.array(image.convert("RGBA"))
-    except (binascii.Error, OSError) as error:
+    except Exception as error:  # decoders raise whatever they like on a broken file
         raise ValueError(f"mask: expected a PNG file in base64, got {text[:20]!r}... ({error})") from error
 
 
@@ -110,7 +110,7 @@ class Stylized(RadiusModel):
         radius: largest radius that is sampled, in px, above 0.5 and at most 128.
 
     Raises:
-        TypeError: ``mask`` is neither of these.
+        TypeError: ``mask`` is neither of these, or another argument not a number.
         ValueError: an argument is out of range.
 
     Example:
@@ -125,8 +125,7 @@ class Stylized(RadiusModel):
     tints = True
 
     def __init__(self, mask: Mask | str | None = None, shift: float = 0.04, radius: float = 64.0) -> None:
-        if not 0 <= shift <= 0.5:
-            raise ValueError(f"shift: expected a number from 0 to 0.5, got {shift}")
+        shift, radius = check_number("shift", shift, 0, 0.5), check_number("radius", radius)
         if not MIN_RADIUS < radius <= 128:
             raise ValueError(f"radius: expected a number of px above {MIN_RADIUS} and at most 128, got {radius}")
         self.mask = star() if mask is None else decoded(mask) if isinstance(mask, str) else _checked(mask)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchbokeh.ops._checks import check_number
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 from torchbokeh.psfs.tracing import cropped
 
@@ -128,6 +129,7 @@ class Volume(PsfModel):
         focal: length of the camera in px, at least `REACH`: how wide a glow is.
 
     Raises:
+        TypeError: an argument is not a number.
         ValueError: an argument is out of range.
 
     Source:
@@ -147,6 +149,8 @@ class Volume(PsfModel):
     tints = True
 
     def __init__(self, density: float = 0.9, distance: float = 5.0, focal: float = 1024.0) -> None:
+        for name, value in (("density", density), ("distance", distance), ("focal", focal)):
+            check_number(name, value)
         if not 0 < density < math.inf:
             raise ValueError(f"density: expected a finite number above 0, got {density}")
         if not 0 < distance <= 8:

@@ -1,6 +1,6 @@
 """The reference renderer: the mean of many views through the lens while the shutter is open."""
 
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 from torch import Tensor, nn
@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torchbokeh._signed import signed_coc
 from torchbokeh.layer_views import accumulate_layers
 from torchbokeh.lens import Lens
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops import sampling
+from torchbokeh.ops._checks import check_image, check_whole
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.prism import Prism
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
@@ -16,6 +17,12 @@ from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene
 from torchbokeh.scenes.views import accumulate_scene
 from torchbokeh.views import Views
+
+MOST = 1 << 20
+"""Views, and sub-samples of each, at most: there are tables of them."""
+
+LAST = (1 << 62) - 1
+"""Largest seed, and number of raster cells per pixel."""
 
 
 class AccumulationBuffer(nn.Module):
@@ -33,6 +40,8 @@ class AccumulationBuffer(nn.Module):
     * ``reuse`` (3.3): views that put a card on the same raster cell share one rendering of it.
     * ``subsamples`` (3.4): every view is blurred once more over the lens around it, by casting rays through its own
       depth.
+
+    A pixel of a layer that is NaN or infinite spoils no more than its PSF, in its channel.
 
     Memory does not grow with the number of views, but where a gradient is asked for: that keeps every view.
 
@@ -83,18 +92,18 @@ class AccumulationBuffer(nn.Module):
             raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
         self.lens = lens
         self.aperture = parse_aperture(aperture)
-        self.views = _whole("views", views, 1)
-        if level_of_detail == "auto":
+        self.views = check_whole("views", views, 1, MOST)
+        if isinstance(level_of_detail, str) and level_of_detail == "auto":
             level_of_detail = min(1.0, 2 / self.views)
         if not isinstance(level_of_detail, Real) or isinstance(level_of_detail, bool):
             raise TypeError(f"level_of_detail: expected a number or 'auto', got {level_of_detail!r}")
         if not 0 <= level_of_detail <= 1:
             raise ValueError(f"level_of_detail: expected a share from 0 to 1, got {level_of_detail}")
         self.level_of_detail = float(level_of_detail)
-        self.reuse = _whole("reuse", reuse, 0)
-        self.subsamples = _whole("subsamples", subsamples, 0)
-        self.seed = None if seed is None else _whole("seed", seed, 0)
-        self.first = _whole("first", first, 0)
+        self.reuse = check_whole("reuse", reuse, 0, LAST)
+        self.subsamples = check_whole("subsamples", subsamples, 0, MOST)
+        self.seed = None if seed is None else check_whole("seed", seed, 0, LAST)
+        self.first = check_whole("first", first, 0, sampling.MOST)
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
@@ -157,13 +166,3 @@ class AccumulationBuffer(nn.Module):
     def _spread(self, lens: Lens | None, size: tuple[int, int]) -> tuple[Views, Prism | None]:
         """The views, and what a lens does to their wavelengths where these are told apart."""
         return Views.spread(self.views, self.aperture.profile(), first=self.first, seed=self.seed), None
-
-
-def _whole(name: str, value: int, low: int) -> int:
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected an int, got {value!r}")
-    if value < low:
-        raise ValueError(f"{name}: expected at least {low}, got {value}")
-    if value >= 1 << 62:
-        raise ValueError(f"{name}: expected below 2**62, got {value}")
-    return int(value)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchbokeh.lens import ThinLens
 from torchbokeh.lens_blur import LensBlur
+from torchbokeh.ops._checks import check_image, check_whole
 from torchbokeh.psfs import Aperture
 
 Range = float | tuple[float, float]  # one value, or the ends of a range
@@ -25,6 +26,7 @@ F_NUMBER = (1.4, 8.0)
 SENSOR_WIDTH = 0.036  # metres: full frame
 FOCUS_DISTANCE = (0.5, 10.0)  # metres
 FOCUS_QUANTILE = (0.05, 0.95)  # of the depths of a picture
+MOST = 1 << 24  # lenses at a time
 
 
 def plausible_lenses(
@@ -45,8 +47,8 @@ def plausible_lenses(
         ``focal_length``, ``f_number``, ``sensor_width`` and ``focus_distance``, each ``(B,)``; lengths in metres.
 
     Raises:
-        TypeError: ``count`` is no int, or ``depth`` no floating-point tensor.
-        ValueError: ``count`` < 0, or a ``depth`` of another shape.
+        TypeError: ``count`` is no int, ``generator`` no generator, or ``depth`` no floating-point tensor.
+        ValueError: ``count`` is out of its range, or a ``depth`` of another shape or not above 0.
 
     Example:
         >>> import torch
@@ -56,15 +58,18 @@ def plausible_lenses(
         >>> lens.coc(torch.full((4, 1, 2, 2), 3.0), width=640).shape
         torch.Size([4, 1, 2, 2])
     """
-    if not isinstance(count, int) or isinstance(count, bool):
-        raise TypeError(f"count: expected an int, got {count!r}")
-    if count < 0:
-        raise ValueError(f"count: expected at least 0, got {count}")
+    check_whole("count", count, 0, MOST)
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise TypeError(f"generator: expected a torch.Generator or None, got {type(generator).__name__}")
+    if depth is not None:
+        depth = _check_depth(depth, count)
+        if not bool((depth > 0).all()):
+            raise ValueError(f"depth: expected values above 0 (inf is sky), got {int((~(depth > 0)).sum())} others")
     device = torch.device("cpu") if generator is None else generator.device
     focus = {"focus_distance": FOCUS_DISTANCE} if depth is None else {"focus_quantile": FOCUS_QUANTILE}
     optics = {"focal_length": FOCAL_LENGTH, "f_number": F_NUMBER, "sensor_width": (SENSOR_WIDTH, SENSOR_WIDTH)}
     drawn = _draw(optics | focus, count, generator, device, torch.float32)
-    return drawn if depth is None else _focused(drawn, _check_depth(depth, count))
+    return drawn if depth is None else _focused(drawn, depth)
 
 
 class RandomLensBlur(IntensityAugmentationBase2D):
@@ -176,6 +181,8 @@ class RandomLensBlur(IntensityAugmentationBase2D):
             TypeError: no depth, or one that is no floating-point tensor.
             ValueError: shapes, devices or values do not fit: see the message.
         """
+        picture = isinstance(input, Tensor) and input.dim() == 3
+        check_image("input", input, (3, "H", "W") if picture else ("B", 3, "H", "W"))
         if depth is not None:
             kwargs["depth"] = depth
         return super().forward(input, params, **kwargs)

@@ -57,6 +57,8 @@ def _build(args: argparse.Namespace) -> None:
     from torchbokeh.psfs.represent import Target
 
     path = args.out or Path(f"{args.model}.safetensors")
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; name a file in it")
     check_writable(path.with_suffix(".png"))
     target = None if args.ssim is None else Target(ssim=args.ssim)
     start = time.perf_counter()

@@ -85,6 +85,8 @@ class Dispersion(Held):
         equaliser: Weight = None,
     ) -> None:
         super().__init__()
+        if not isinstance(glass, str):
+            raise TypeError(f"glass: expected a name, got {type(glass).__name__}")
         relative_focal_length(glass, RGB[1], reference)
         for name, given in (("axial_map", axial_map), ("lateral_map", lateral_map)):
             if given is not None and not isinstance(given, FieldMap):

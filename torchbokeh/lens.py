@@ -11,6 +11,12 @@ from torchbokeh.dispersion import Dispersion
 from torchbokeh.field_map import Field
 from torchbokeh.held import Held, check_parameter
 
+RANGES = {"focal_length": (1e-6, 1e4), "f_number": (1e-6, 1e12), "sensor_width": (1e-4, 1e4)}
+"""Parameters of a `ThinLens`: beyond these, radii would leave the range of float32."""
+
+NEAREST = 1e-9
+"""Metres: what is nearer counts as depth 0, whose radius is infinite."""
+
 
 class Lens(Held, ABC):
     """What every lens can do: turn depth into a signed CoC radius in pixels, and back.
@@ -63,7 +69,7 @@ class Lens(Held, ABC):
                 raise ValueError(f"{name}: expected the lens's device {value.device}, got {x.device}")
             value = value.to(dtype)
             if value.dim() == 1:
-                if len(value) > 1 and (x.dim() < 3 or x.shape[0] != len(value)):
+                if value.shape[0] > 1 and (x.dim() < 3 or x.shape[0] != value.shape[0]):
                     raise ValueError(
                         f"{name}: expected a batch of {len(value)} like the lens, got shape {tuple(x.shape)}"
                     )
@@ -84,7 +90,7 @@ class ThinLens(Lens):
     the gradients.
 
     Args:
-        focal_length: F, in metres, > 0.
+        focal_length: F, in metres, > 0, within `RANGES` as the f-number and the sensor width are.
         f_number: N, > 0; the aperture is ``F / N`` wide.
         focus_distance: df, in metres from the lens, > F; ``inf`` focuses on infinity.
         sensor_width: in metres, > 0; the image's ``width`` pixels cover it.
@@ -129,14 +135,17 @@ class ThinLens(Lens):
             focus_distance=focus_distance,
             sensor_width=sensor_width,
         )
-        for name in ("focal_length", "f_number", "sensor_width"):
+        for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             check_parameter(name, value, (value > 0) & value.isfinite(), "a positive finite value")
+            check_parameter(name, value, (value >= low) & (value <= high), f"from {low:g} to {high:g}")
         focus, focal = torch.broadcast_tensors(self.focus_distance, self.focal_length)
-        nearest = focal[~(focus > focal)][:1].tolist()
+        # Nearer to it by less, rounding would make the blur infinite.
+        beyond = (focus > focal) & (1 - focal.float() / focus.float() > 1e-6)
+        nearest = focal[~beyond][:1].tolist()
         if nearest:
             want = f"more than the focal length ({nearest[0]:g} m)"
-            check_parameter("focus_distance", focus, focus > focal, want)
+            check_parameter("focus_distance", focus, beyond, want)
         if dispersion is not None and not isinstance(dispersion, Dispersion):
             raise TypeError(f"dispersion: expected a Dispersion or None, got {type(dispersion).__name__}")
         self.dispersion = dispersion
@@ -168,7 +177,7 @@ class ThinLens(Lens):
         """
         d, f, n, df, sensor = self._align("depth", depth, width)
         if not torch.compiler.is_compiling():
-            _check_map("depth", d, d > 0, "values above 0 (inf is sky)")
+            _check_map("depth", d, d >= NEAREST, "values above 0 (inf is sky)")
         gain, focus = _optics(f, n, df, sensor, width)
         # reciprocal(), not a quotient: its derivative, minus its own square, is 0 at inf and never NaN.
         return gain * (focus - d.reciprocal())
@@ -220,6 +229,7 @@ class ThinLens(Lens):
             >>> round(lens.coc_shift(475.0, width=1920).item(), 2)
             6.36
         """
+        _check_width(width)
         if self.dispersion is None:
             return super().coc_shift(wavelength, width, field)
         gain, _ = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
@@ -332,6 +342,7 @@ class DisparityLens(Lens):
         self._hold(strength=strength, focus_disparity=focus_disparity)
         for name, value in self._values().items():
             check_parameter(name, value, value.isfinite(), "a finite value")
+            check_parameter(name, value, value.abs() <= 1e18, "at most 1e18 in size")
 
     def coc(self, depth: Tensor, width: int) -> Tensor:
         """Signed CoC radius in pixels, positive behind the disparity in focus.
@@ -349,9 +360,10 @@ class DisparityLens(Lens):
                 looked at as in :meth:`ThinLens.coc`.
         """
         disparity, strength, focus = self._align("depth", depth, width)
+        coc = strength * (focus - disparity)
         if not torch.compiler.is_compiling():
-            _check_map("depth", disparity, disparity.isfinite(), "finite disparities")
-        return strength * (focus - disparity)
+            _check_map("depth", disparity, coc.isfinite(), "finite disparities")
+        return coc
 
     def depth(self, coc: Tensor, width: int) -> Tensor:
         """Disparity at which the signed CoC radius is ``coc``: the inverse of :meth:`coc`.

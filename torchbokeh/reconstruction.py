@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchbokeh.bank_samples import splat_samples
-from torchbokeh.bank_splatting import bank_of_motion
+from torchbokeh.bank_splatting import bank_of_motion, splat_bank
 from torchbokeh.layers import bin_centres
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
@@ -62,12 +61,17 @@ def pinhole_position(samples: Samples) -> Tensor:
     Returns:
         ``(B, S, 2, H, W)``: x and y in px, 0 being the centre of the first pixel.
 
+    Raises:
+        TypeError: not `Samples`.
+
     Example:
         >>> from torchbokeh import scenes
         >>> from torchbokeh.scenes import samples
         >>> pinhole_position(samples(*scenes.whirl(size=(24, 32)))).shape
         torch.Size([1, 1, 2, 24, 32])
     """
+    if not isinstance(samples, Samples):
+        raise TypeError(f"samples: expected Samples, got {type(samples).__name__}")
     return samples.position - samples.coc * samples.lens - samples.time * samples.motion
 
 
@@ -127,7 +131,7 @@ def _checked(samples: Samples) -> Samples:
     if not isinstance(present, Tensor) or present.dtype != torch.bool:
         kind = present.dtype if isinstance(present, Tensor) else type(present).__name__
         raise TypeError(f"samples.present: expected a tensor of bools, got {kind}")
-    check_image("samples.present", present.to(samples.colour), (b, s, 1, h, w))
+    check_image("samples.present", present.float(), (b, s, 1, h, w), like=samples.colour)
     dtype, maps = compute_dtype(samples.colour), {}
     for name, channels in CHANNELS.items():
         given = check_image(f"samples.{name}", getattr(samples, name), (b, s, channels, h, w), like=samples.colour)
@@ -171,4 +175,4 @@ def _splat_bins(samples: Samples, centres: tuple[float, ...], bank: PsfBank) -> 
 def _splat_about(values: Tensor, one: Samples, bank: PsfBank) -> Tensor:
     """Splat ``(B, C, H, W)`` about the pinhole positions of one sample of each pixel."""
     shift = pinhole_position(one) - pixel_positions(values)
-    return splat_samples([(values, Labels(coc=one.coc, motion=one.motion, offset=shift))], bank)
+    return splat_bank(values, Labels(coc=one.coc, motion=one.motion, offset=shift), bank)

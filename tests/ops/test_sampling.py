@@ -207,9 +207,9 @@ def test_stratified_halton_moves_no_point_far() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: halton(-1), "count: expected 0 or more, got -1"),
-        (lambda: halton(3, first=-2), "first: expected 0 or more, got -2"),
-        (lambda: halton(3, seed=-5), "seed: expected 0 or more, got -5"),
+        (lambda: halton(-1), "count: expected at least 0, got -1"),
+        (lambda: halton(3, first=-2), "first: expected at least 0, got -2"),
+        (lambda: halton(3, seed=-5), "seed: expected at least 0, got -5"),
         (lambda: aperture_points(Disc().profile(), torch.zeros(4)), r"square: expected shape \(N, 2\), got \(4,\)"),
         (
             lambda: aperture_points(Disc().profile(), torch.zeros(4, 3)),

@@ -91,8 +91,8 @@ def test_nothing_half_written_is_left(small: PsfBank, tmp_path: Path, monkeypatc
     def fail(*_: Any) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(module.os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match=r"bank.safetensors: cannot be written \(disk full\)"):
         small.save(tmp_path / "bank.safetensors")
     assert list(tmp_path.iterdir()) == []
 
@@ -239,3 +239,24 @@ def test_a_contact_sheet_shows_five_pictures_of_each(small: PsfBank) -> None:
     sheet = contact_sheet(small, 3, 40)
     assert sheet.shape == (1, 3, 3 * 44, 5 * 44)
     assert 0 <= sheet.min() < sheet.max() <= 1
+
+
+@pytest.mark.parametrize("name", ["stylized", "physical-lens"])
+def test_a_dense_sample_is_the_psf_and_nothing_beyond_its_points(name: str) -> None:
+    bank = PsfBank.load(name)
+    used = torch.zeros(len(bank), dtype=torch.bool)
+    for domain in bank.domains.unique().tolist():
+        used[(bank.domains == domain).nonzero()[-1]] = True
+    for fine in (1, 2):
+        dense = bank.dense(used, fine)
+        assert not dense.domains.any()
+        assert torch.equal(dense.counts.diff() > 0, used)
+        assert float(dense.values.min()) >= 0
+        assert bool((dense.reach() <= bank.reach() + 0.5)[used].all())
+        torch.testing.assert_close(dense.gains()[used], bank.gains()[used], rtol=1e-5, atol=1e-6)
+    for number in used.nonzero()[:, 0].tolist():
+        want = bank.model.dense(bank.model.grid.centres()[number].tolist())
+        want /= want.sum((1, 2), keepdims=True)
+        got = centred(bank._picture(number), want.shape[1:])
+        got /= got.sum((1, 2), keepdims=True)
+        assert np.abs(got - want).sum() / 3 < 0.2

@@ -175,3 +175,12 @@ def test_a_turned_capsule_is_a_capsule(radius: float, length: float) -> None:
     y, x = np.indices(ahead.shape) - np.array(ahead.shape)[:, None, None] // 2
     assert [(ahead * x).sum(), (ahead * y).sum()] == pytest.approx([0.3 * length, -0.4 * length], abs=0.05)
     assert turned_capsule(0.0, (0.0, 0.0)).max() == pytest.approx(1, abs=0.3)
+
+
+def test_a_turned_capsule_is_cut_where_nobody_looks() -> None:
+    whole = turned_capsule(3.0, (40.0, -30.0), 0.5)
+    cut = turned_capsule(3.0, (40.0, -30.0), 0.5, (12, 9))
+    inner = centred(whole[None], (19, 25))[0]
+    assert cut.shape == (19, 25)
+    np.testing.assert_allclose(cut, inner / inner.sum(), atol=1e-12)
+    assert turned_capsule(2.0, (1e5, 1e5), 0.0, (7, 5)).shape == (11, 15)

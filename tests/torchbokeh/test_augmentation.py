@@ -230,7 +230,7 @@ def test_bad_calls_are_refused() -> None:
             aug(image, depth=bad)
     with pytest.raises(ValueError, match="depth: expected values above 0"):
         aug(image, depth=-depth)
-    with pytest.raises(ValueError, match="image: expected shape"):
+    with pytest.raises(ValueError, match="input: expected shape"):
         aug(image[:, :1], depth=depth)
     with pytest.raises(ValueError, match="params: expected those of 3 pictures, got those of 2"):
         aug(image, params=aug.forward_parameters((2, 3, HEIGHT, WIDTH)), depth=depth)

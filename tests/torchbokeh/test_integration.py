@@ -186,3 +186,12 @@ def test_examples_in_the_documentation() -> None:
     result = doctest.testmod(torchbokeh.integration)
     assert result.attempted > 6
     assert result.failed == 0
+
+
+@every_integrator
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_changes_nothing(integrator: Integrator, dtype: torch.dtype) -> None:
+    b = random(1, 2, 9, 12).float()
+    with torch.autocast("cpu", dtype=dtype):
+        out = integrator(b)
+    assert torch.equal(out, integrator(b))

@@ -1,10 +1,11 @@
 """Seeds: the same key gives the same numbers in every process, and settings are given or drawn."""
 
 import hashlib
-from collections.abc import Sequence
 from numbers import Integral
 
 import numpy as np
+
+from torchbokeh.ops._checks import check_size as check_size
 
 
 def rng(seed: int, *keys: int | str) -> np.random.Generator:
@@ -40,31 +41,6 @@ def rng(seed: int, *keys: int | str) -> np.random.Generator:
     written = ascii([str(key) if isinstance(key, str) else int(key) for key in (seed, *keys)])
     digest = hashlib.blake2b(written.encode(), digest_size=16).digest()
     return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
-
-
-def check_size(size: Sequence[int]) -> tuple[int, int]:
-    """The height and the width in pixels, both at least 1.
-
-    Args:
-        size: (H, W).
-
-    Returns:
-        The two as ints.
-
-    Raises:
-        TypeError: not two integers.
-        ValueError: one of them is below 1.
-
-    Example:
-        >>> check_size([3, 5])
-        (3, 5)
-    """
-    pair = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
-    if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) for n in pair):
-        raise TypeError(f"size: expected two integers (H, W), got {size!r}")
-    if min(pair) < 1:
-        raise ValueError(f"size: expected (H, W) of at least 1, got {size!r}")
-    return int(pair[0]), int(pair[1])
 
 
 def setting(name: str, value: float | None, drawn: float, low: float, high: float) -> float:

@@ -45,7 +45,7 @@ class Camera:
             if value.dim():
                 raise ValueError(f"lens: expected scalar parameters, got {name} of shape {tuple(value.shape)}")
         object.__setattr__(self, "size", check_size(self.size))
-        if not isinstance(self.shutter, Real):
+        if not isinstance(self.shutter, Real) or isinstance(self.shutter, bool):
             raise TypeError(f"shutter: expected seconds, got {self.shutter!r}")
         if not 0 <= self.shutter < float("inf"):
             raise ValueError(f"shutter: expected seconds, 0 or more, got {self.shutter}")

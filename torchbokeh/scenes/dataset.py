@@ -11,8 +11,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchbokeh.accumulation import AccumulationBuffer
-from torchbokeh.scenes._random import check_size, count_setting, rng
+from torchbokeh.ops._checks import check_whole
+from torchbokeh.scenes._random import check_size, rng
 from torchbokeh.scenes.recipes import RECIPES
+
+MOST_LAYERS = 1024
 
 
 class ProceduralDataset(Dataset[dict[str, Any]]):
@@ -35,7 +38,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         blur: smallest and largest blur of a sample in px, where the blur of a sample is the largest CoC radius of
             anything in it; ``None`` for 1 % to 8 % of the width.
         views: of the target. Highlights want thousands, other things hundreds.
-        layers: L; what lies deeper is flattened into the last one.
+        layers: L, at most `MOST_LAYERS`; what lies deeper is flattened into the last one.
         level_of_detail: as for `torchbokeh.AccumulationBuffer`; ``"auto"`` takes the grain from pictures of few views.
         reuse: as for `torchbokeh.AccumulationBuffer`.
 
@@ -65,9 +68,11 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
     ) -> None:
         rng(seed)
         self.seed = int(seed)
-        self.resolution = check_size(resolution)
-        self.length = count_setting("length", length, 0, 0, sys.maxsize)
+        self.resolution = check_size(resolution, "resolution")
+        self.length = check_whole("length", length, 0, sys.maxsize)
         names = tuple(RECIPES) if recipes is None else recipes
+        if not isinstance(names, Sequence):
+            raise TypeError(f"recipes: expected names or None, got {recipes!r}")
         self.recipes = (names,) if isinstance(names, str) else tuple(names)
         for name in self.recipes:
             if name not in RECIPES:
@@ -81,7 +86,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         self.blur = float(pair[0]), float(pair[1])
         if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):
             raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
-        self.layers = count_setting("layers", layers, 0, 1, sys.maxsize)
+        self.layers = check_whole("layers", layers, 1, MOST_LAYERS)
         buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
         self.target: dict[str, Any] = {
             "views": buffer.views,

@@ -4,12 +4,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchbokeh.ops._checks import MOST_PIXELS, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.planes import Plates, pixel_centres
 from torchbokeh.ops.sampling import aperture_points
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.reconstruction import Samples
-from torchbokeh.scenes._random import count_setting, rng
+from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3
 
@@ -17,7 +18,7 @@ CHUNK = 1 << 18
 """Rays times cards that are looked at together."""
 
 MOST = 1 << 16
-"""Most rays of a pixel."""
+"""Most rays of a pixel; of a picture, no more than `torchbokeh.ops._checks.MOST_PIXELS`."""
 
 
 def samples(scene: Scene, camera: Camera, per_pixel: int = 1, seed: int = 0) -> Samples:
@@ -55,7 +56,8 @@ def samples(scene: Scene, camera: Camera, per_pixel: int = 1, seed: int = 0) -> 
             raise TypeError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
     if len(scene) == 0:
         raise ValueError("scene: expected at least one card or a backdrop, got none")
-    per_pixel = count_setting("per_pixel", per_pixel, 1, 1, MOST)
+    height, width = camera.size
+    per_pixel = check_whole("per_pixel", per_pixel, 1, max(1, min(MOST, MOST_PIXELS // (height * width))))
     scene = scene.to("cpu")
     plates, rays = scene.plates(levels=1), _rays(camera.size, per_pixel, seed)
     hits = [_hits(scene, plates, camera, part) for part in rays.split(max(1, CHUNK // len(scene)))]

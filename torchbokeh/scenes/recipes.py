@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.lens import ThinLens
+from torchbokeh.ops._checks import check_whole
 from torchbokeh.scenes import shapes, textures
 from torchbokeh.scenes._random import check_size, rng
 from torchbokeh.scenes.camera import Camera
@@ -17,6 +18,7 @@ from torchbokeh.scenes.sprite import Backdrop, Sprite, place
 
 FOCAL_LENGTH, SENSOR_WIDTH = 0.050, 0.036
 SHUTTER = 1 / 50
+MOST_CARDS = 100_000
 BLUR = 0.04
 """Largest CoC radius, as a share of the picture's width, where a recipe is not told another."""
 
@@ -235,8 +237,7 @@ def stack(
     seed: int = 0, size: tuple[int, int] = (256, 256), blur: float | None = None, *, count: int = 300
 ) -> tuple[Scene, Camera]:
     """Hundreds of small cards, one behind the other: what the number of things costs."""
-    if not isinstance(count, int) or count < 1:
-        raise ValueError(f"count: expected at least one card, got {count!r}")
+    check_whole("count", count, 1, MOST_CARDS)
     s = Studio("stack", seed, size, 2.5, blur)
     kinds = [s.card(0.15) for _ in range(12)]
     for depth in np.linspace(1 / 1.2, 1 / 12.0, count):

@@ -1,18 +1,22 @@
 """Scenes of textured cards, and the pinhole picture that a renderer starts from."""
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Integral
 
 import torch
 from torch import Tensor
 
+from torchbokeh.ops._checks import check_whole
 from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.ops.planes import Plates, pixel_centres, render_planes
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.layering import Fragments, stack_layers
 from torchbokeh.scenes.sprite import Backdrop, Sprite, place
+
+MOST_SAMPLES = 256
+"""Points of each pixel and direction that a card is averaged over, at most."""
 
 LEVELS = 16
 """Most levels of a texture: more than any texture has."""
@@ -117,15 +121,13 @@ class Scene:
 
         Raises:
             TypeError: ``camera`` is no `Camera`, or a number is no int.
-            ValueError: ``samples`` or ``layers`` is not positive.
+            ValueError: ``samples`` or ``layers`` is not positive, or ``samples`` above `MOST_SAMPLES`.
         """
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
-        for name, value in (("samples", samples), ("layers", 1 if layers is None else layers)):
-            if not isinstance(value, Integral) or isinstance(value, bool):
-                raise TypeError(f"{name}: expected an int, got {value!r}")
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
+        check_whole("samples", samples, 1, MOST_SAMPLES)
+        if layers is not None:
+            check_whole("layers", layers, 1, sys.maxsize)
         return stack_layers(self._fragments(camera, samples), layers, camera.size)
 
     def _fragments(self, camera: Camera, samples: int) -> list[Fragments]:

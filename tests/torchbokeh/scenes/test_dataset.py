@@ -268,8 +268,8 @@ def test_length_and_indices() -> None:
     [
         ({"seed": -1}, ValueError, "seed: "),
         ({"seed": 1.5}, TypeError, "seed: .* got float"),
-        ({"resolution": (0, 4)}, ValueError, "size: "),
-        ({"resolution": 256}, TypeError, "size: "),
+        ({"resolution": (0, 4)}, ValueError, "resolution: "),
+        ({"resolution": 256}, TypeError, "resolution: "),
         ({"length": -1}, ValueError, "length: .* got -1"),
         ({"length": 2.5}, TypeError, "length: "),
         ({"length": sys.maxsize + 1}, ValueError, "length: "),

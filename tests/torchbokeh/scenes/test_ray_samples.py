@@ -128,9 +128,9 @@ def test_bad_arguments_are_named() -> None:
         samples(dot(3.0), None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="scene: expected at least one card or a backdrop, got none"):
         samples(Scene(()), camera())
-    with pytest.raises(ValueError, match="per_pixel: expected 1 to 65536, got 0"):
+    with pytest.raises(ValueError, match="per_pixel: expected at least 1, got 0"):
         samples(dot(3.0), camera(), 0)
-    with pytest.raises(TypeError, match="per_pixel: expected an int, got float"):
+    with pytest.raises(TypeError, match=r"per_pixel: expected an int, got 1\.5"):
         samples(dot(3.0), camera(), 1.5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="seed: expected 0 or more, got -1"):
         samples(dot(3.0), camera(), seed=-1)
