@@ -10,6 +10,7 @@ from torchbokeh.bank_splatting import bank_of_motion
 from torchbokeh.layers import Moving
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.ops.spans import working_dtype
 
 Motion = Tensor | Sequence[Tensor] | None
 
@@ -57,12 +58,14 @@ def look_at_motion(
     if image.numel() == 0 or (not found and ends is None):
         return 0.0, None, 0.0
     with torch.no_grad():
+        work = working_dtype(image.device)  # in half precision the square of 300 px is infinite already
         change = image.new_zeros(1) if ends is None else ends.diff(dim=-3).abs().max()[None]
         look = [change]
         if found:
-            length = torch.stack([way.square().sum(-3) for way in found]).sqrt().sum(0).max()
+            length = torch.stack([way.to(work).square().sum(-3) for way in found]).sqrt().sum(0).max()
             look += [length[None], *found[0].movedim(-3, 0).flatten(1).aminmax(dim=1)]
-        change_by, longest, *limits = torch.cat([t.to(change) for t in look]).tolist() + ([] if found else [0.0])
+        numbers = torch.cat([t.to(image.device, work) for t in look]).tolist()
+        change_by, longest, *limits = numbers if found else [*numbers, 0.0]
     if not math.isfinite(longest):
         bad = sum(int((~way.isfinite()).sum()) for way in found)
         raise ValueError(f"motion: expected finite values, got {bad} that are not")

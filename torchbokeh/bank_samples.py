@@ -14,7 +14,7 @@ from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.integrate import poisson_fft, running_sum_x
 from torchbokeh.ops.points import splat_points
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.model import Labels, Place, scaled
+from torchbokeh.psfs.model import Labels, Place, field_of, scaled
 from torchbokeh.psfs.represent import DOMAINS, Domain
 
 _INTEGRALS: dict[Domain, Callable[[Tensor], Tensor]] = {
@@ -70,8 +70,18 @@ def _listed(values: Tensor, labels: Labels, alive: Tensor) -> tuple[Tensor, Labe
     return in_rows(picked(values) * there), found, Canvas((height, width), in_rows(pixels))
 
 
+def located(labels: Labels, bank: PsfBank, like: Tensor) -> Labels:
+    """Labels of a whole picture, with the place of each pixel where PSFs depend on it: before any are left out."""
+    return labels._replace(field=field_of(like)) if bank.model.fields and labels.field is None else labels
+
+
 def splat_samples(
-    sources: Sequence[tuple[Tensor, Labels]], bank: PsfBank, size: int = 1, interpolate: bool = False
+    sources: Sequence[tuple[Tensor, Labels]],
+    bank: PsfBank,
+    size: int = 1,
+    interpolate: bool = False,
+    *,
+    dense: bool = False,
 ) -> Tensor:
     """Splat pictures with the PSFs of their labels, and add them up.
 
@@ -80,11 +90,15 @@ def splat_samples(
         bank: the PSFs.
         size: side of a pixel of the values in px of the labels.
         interpolate: splat the neighbouring samples of the grid as well, by their share.
+        dense: draw the PSFs pixel by pixel, with nothing beyond their reach: for few bright pixels.
 
     Returns:
         ``(B, C, H, W)``.
     """
-    return _together([d for values, labels in sources for d in _drawn(values, labels, bank, size, interpolate)], bank)
+    found = [
+        d for values, labels in sources for d in _drawn(values, located(labels, bank, values), bank, size, interpolate)
+    ]
+    return _together(found, bank, dense)
 
 
 class _Drawn(NamedTuple):
@@ -119,12 +133,16 @@ def _drawn(values: Tensor, labels: Labels, bank: PsfBank, size: int, interpolate
             yield _Drawn(weighed, number[:, None], drawn, canvas)
 
 
-def _together(drawn: Sequence[_Drawn], bank: PsfBank) -> Tensor:
+def _together(drawn: Sequence[_Drawn], bank: PsfBank, dense: bool) -> Tensor:
     """All samples of a domain go into one buffer, which is integrated once."""
     (height, width), first = drawn[0].canvas.size, drawn[0].values
     out = first.new_zeros(*first.shape[:2], height, width)
-    reach, domains = bank.reach(), bank.domains
     used = [d.numbers[:, 0][spreading(d.values)].bincount(minlength=len(bank)) > 0 for d in drawn]
+    if dense:
+        # Points that are turned or enlarged would leave gaps between pixels.
+        fine = max(1 if d.place.frame is None else math.ceil(2 * _stretch(d.place) / math.sqrt(2)) for d in drawn)
+        bank = bank.dense(torch.stack(used).any(0), fine)
+    reach, domains = bank.reach(), bank.domains
     for number, domain in enumerate(DOMAINS):
         here = [(d, u & (domains == number)) for d, u in zip(drawn, used, strict=True)]
         here = [(d, u) for d, u in here if bool(u.any())]

@@ -7,7 +7,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchbokeh.bank_samples import splat_samples, spreading
+from torchbokeh.bank_samples import located, splat_samples, spreading
 from torchbokeh.ops._checks import check_image
 from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.composite import TINY
@@ -24,6 +24,9 @@ BRIGHT = 0.5
 
 MOST = 4096
 """Highlights that are drawn densely, at most: the brightest."""
+
+CLIPPED = 3
+"""How often the mean of a picture is taken anew, without what is far above the last one."""
 
 
 @lru_cache(maxsize=4)
@@ -86,19 +89,23 @@ def packed(labels: Labels) -> Tensor:
         maps += [x * x, x * y, y * y]
     if labels.offset is not None:
         maps.append(labels.offset)
+    if labels.field is not None:
+        maps.append(labels.field)
     return torch.cat(maps, 1) if maps else needed(labels)[:, :0]
 
 
 def unpacked(coc: Tensor, maps: Tensor, like: Labels) -> Labels:
     """Labels from averages of `packed`: of the same kinds as ``like``."""
-    depth = motion = offset = None
+    depth = motion = offset = field = None
     if like.depth is not None:
         depth, maps = maps[:, :1].clamp_min(1e-12).reciprocal(), maps[:, 1:]
     if like.motion is not None:
         motion, maps = _along(*maps[:, :3].split(1, 1)), maps[:, 3:]
     if like.offset is not None:
-        offset = maps
-    return Labels(coc, depth, motion, offset)
+        offset, maps = maps[:, :2], maps[:, 2:]
+    if like.field is not None:
+        field = maps
+    return Labels(coc, depth, motion, offset, field)
 
 
 def _along(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
@@ -136,8 +143,9 @@ def splat_bank(
     Raises:
         ValueError: the model needs another label.
     """
-    parts = [labels] if isinstance(labels, Labels) else list(labels)
-    dense, values = _highlights(values if len(parts) == 1 else values / len(parts), parts, bank)
+    parts = [located(p, bank, values) for p in ([labels] if isinstance(labels, Labels) else labels)]
+    values, parts = _confined(values, parts, bank)
+    dense, values = _highlights(values if len(parts) == 1 else values / len(parts), parts, bank, interpolate)
 
     def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
         out = torch.zeros_like(cells)
@@ -186,36 +194,81 @@ def splat_bank(
     return dense + merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
 
 
-def _highlights(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> tuple[Tensor | float, Tensor]:
+def _confined(values: Tensor, parts: list[Labels], bank: PsfBank) -> tuple[Tensor, list[Labels]]:
+    """The same picture without discs that are far larger than it, whose buffers would be as large as they.
+
+    A disc that covers the whole picture from each end of its way has the same density all over it, the reciprocal of
+    its area. So a smaller one that does that too stands for it, with as much less light.
+    """
+    coc = parts[0].coc
+    if not isinstance(bank.model, Combined) or coc is None or any(p.coc is not coc for p in parts):
+        return values, parts
+    ways = [t for p in parts for t in (p.motion, p.offset) if t is not None]
+    lengths = [way.detach().square().sum(1, keepdim=True).sqrt() for way in ways]
+    enough = torch.stack([torch.zeros_like(coc), *lengths]).amax(0) * 1.5 + math.hypot(*coc.shape[2:]) + 1
+    if not bool((coc.detach().abs() > enough).any()):
+        return values, parts
+    ratio = (enough / coc.abs().clamp_min(TINY)).clamp(max=1.0)
+    smaller = coc * ratio
+    return values * ratio.square(), [p._replace(coc=smaller) for p in parts]
+
+
+def _highlights(
+    values: Tensor, parts: Sequence[Labels], bank: PsfBank, interpolate: bool
+) -> tuple[Tensor | float, Tensor]:
     """What pixels spread that are so bright that the ripples of a sparse PSF would be seen, and all other values."""
-    maps = [(p.coc, p.motion, p.offset) for p in parts if p.coc is not None and p.motion is not None]
-    if not maps or not values.numel() or not isinstance(bank.model, Combined):
+    if not values.numel():
         return 0.0, values
     with torch.no_grad():
-        brightness = values.abs()
-        radius = torch.stack([coc.abs().clamp_min(MIN_RADIUS) for coc, _, _ in maps]).mean(0)
-        length = torch.stack([motion.square().sum(1, keepdim=True).sqrt() for _, motion, _ in maps]).sum(0)
-        alive = (values != 0).any(1, keepdim=True).sum((2, 3), keepdim=True).clamp_min(1)
-        area = radius * (math.pi * radius + 2 * length) / len(maps)
-        bound = brightness.sum((2, 3), keepdim=True) / alive * (BRIGHT * area).clamp_min(LEAST_CONTRAST)
-        excess = (brightness / bound.clamp_min(TINY)).amax(1).flatten()
+        bound = _usual(values) * (BRIGHT * _area(parts, bank)).clamp_min(LEAST_CONTRAST)
+        excess = (values.abs() / bound.clamp_min(TINY)).amax(1).flatten()
         pixels = (excess > 1).nonzero()[:, 0]
         if len(pixels) > MOST:
             pixels = excess.topk(MOST).indices.sort().values
     if not len(pixels):
         return 0.0, values
+    flat = values.movedim(1, 0).reshape(values.shape[1], -1)
+    shape = (values.shape[1], values.shape[0], *values.shape[2:])
+    rest = flat.index_fill(1, pixels, 0.0).reshape(shape).movedim(0, 1)
+    if not isinstance(bank.model, Combined):
+        only = torch.zeros_like(excess).index_fill(0, pixels, 1.0).reshape(-1, 1, *values.shape[2:])
+        return splat_samples([(values * only, part) for part in parts], bank, 1, interpolate, dense=True), rest
 
     def of(t: Tensor) -> Tensor:
         return t.movedim(1, -1).flatten(0, 2)[pixels]
 
     dense = torch.zeros_like(values)
-    for coc, motion, offset in maps:
-        way = of(motion)
-        centre = torch.zeros_like(way) if offset is None else of(offset)
-        dense = dense + splat_capsules(values, pixels, of(coc)[:, 0].abs(), way, centre)
-    rest = values.movedim(1, 0).reshape(values.shape[1], -1).index_fill(1, pixels, 0.0)
-    shape = (values.shape[1], values.shape[0], *values.shape[2:])
-    return dense, rest.reshape(shape).movedim(0, 1)
+    for part in parts:
+        way = of(torch.zeros_like(values[:, :2]) if part.motion is None else part.motion)
+        centre = torch.zeros_like(way) if part.offset is None else of(part.offset)
+        dense = dense + splat_capsules(values, pixels, of(needed(part))[:, 0].abs(), way, centre)
+    return dense, rest
+
+
+def _usual(values: Tensor) -> Tensor:
+    """What each pixel would show ``(B, C, H, W)`` were it no highlight: none raises it, so that none hides another."""
+    brightness, coverage = values.abs(), values[:, -1:].abs()
+    alive = (values != 0).any(1, keepdim=True).to(values.dtype)
+    mean = coverage.sum((2, 3), keepdim=True) / alive.sum((2, 3), keepdim=True).clamp_min(1)
+    coverage = coverage.maximum(mean) * alive
+    total = coverage.sum((2, 3), keepdim=True).clamp_min(TINY)
+    usual = brightness.sum((2, 3), keepdim=True) / total
+    for _ in range(CLIPPED):
+        usual = brightness.minimum(LEAST_CONTRAST * usual * coverage).sum((2, 3), keepdim=True) / total
+    return usual * coverage
+
+
+def _area(parts: Sequence[Labels], bank: PsfBank) -> Tensor:
+    """About how many pixels the light of each is spread over, ``(B, 1, H, W)``."""
+    if not isinstance(bank.model, Combined):
+        places = [place for part in parts for place in bank.model.places(part)]
+        reach = [bank.reach()[bank.model.grid.index(p.coordinates.movedim(1, -1))][:, None] for p in places]
+        scales = [1.0 if p.scale is None else p.scale for p in places]
+        return torch.stack([(r * s).square() for r, s in zip(reach, scales, strict=True)]).mean(0)
+    radius = torch.stack([needed(p).abs().clamp_min(MIN_RADIUS) for p in parts]).mean(0)
+    ways = [p.motion for p in parts if p.motion is not None]
+    length = torch.stack([way.square().sum(1, keepdim=True).sqrt() for way in ways]).sum(0)
+    return radius * (math.pi * radius + 2 * length) / len(parts)
 
 
 def needed(labels: Labels) -> Tensor:

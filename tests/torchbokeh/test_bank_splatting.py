@@ -206,7 +206,13 @@ def test_averages_of_motion_do_not_cancel() -> None:
     with_depth = Labels(coc=depth, depth=depth)
     assert unpacked(depth, packed(with_depth), with_depth).depth[0, 0, 0, 0] == 2
     with pytest.raises(ValueError, match=r"labels\.coc: expected one"):
-        splat_bank(torch.ones(1, 1, 1, 1), Labels(depth=torch.ones(1, 1, 1, 1)), None, Merging(4, 1), highest=1)  # type: ignore[arg-type]
+        splat_bank(
+            torch.ones(1, 1, 1, 1),
+            Labels(depth=torch.ones(1, 1, 1, 1)),
+            PsfBank.load("combined"),
+            Merging(4, 1),
+            highest=1,
+        )
 
 
 @pytest.mark.parametrize("quality", ["exact", "balanced"])
@@ -288,3 +294,51 @@ def test_targets_are_what_a_bank_says_of_itself(bank: PsfBank) -> None:
     assert bank.info["target"] == Target()._asdict()
     assert np.mean(bank.info["ssim"]) > 0.97
     torch.testing.assert_close(bank.gains(), torch.ones_like(bank.gains()), atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["stylized", "physical-lens"])
+def test_pixels_without_more_labels_are_merged(name: str) -> None:
+    image, coc = torch.full((1, 3, 64, 64), 0.7), torch.full((1, 1, 64, 64), 16.0)
+    blur = KernelSplatting(bank=PsfBank.load(name), quality="fast")
+    assert blur.plan(image, coc).highest > 0
+    exact = KernelSplatting(bank=PsfBank.load(name), quality="exact")(image, coc)
+    torch.testing.assert_close(blur(image, coc), exact, atol=1e-3, rtol=0)
+
+
+def test_highlights_of_coloured_psfs_do_not_leak() -> None:
+    bank, image, coc = PsfBank.load("physical-lens"), torch.ones(1, 6, 96, 96), torch.full((1, 1, 96, 96), 6.0)
+    lit = image.clone()
+    lit[:, :3, 36, 40] = 1e6
+    added = (splat_bank(lit, Labels(coc=coc), bank) - splat_bank(image, Labels(coc=coc), bank))[0, :3]
+    y, x = torch.meshgrid(torch.arange(96.0) - 36, torch.arange(96.0) - 40, indexing="ij")
+    assert float(added[:, torch.hypot(y, x) > 45].abs().max()) < 1e-6
+    assert float(added.min()) > -0.5
+    torch.testing.assert_close(added.sum((1, 2)), torch.full((3,), 1e6), rtol=0.01, atol=0)
+
+
+def test_a_cluster_of_highlights_does_not_hide_itself(bank: PsfBank) -> None:
+    image, labels = torch.ones(1, 2, 96, 96), scene(96, 96, 19.0, 8.0, 8.0)
+    lit = image.clone()
+    lit[0, 0, 22:27, 30:35] = 3e5
+    added = (splat_bank(lit, labels, bank) - splat_bank(image, labels, bank))[0, 0]
+    assert float(added[60:].abs().max()) < 1e-3
+
+
+def test_psfs_that_depend_on_the_place_do_not_depend_on_what_is_dark() -> None:
+    # A dark picture is a list of pixels, each of which must keep its place.
+    bank, coc = PsfBank.load("physical-lens"), torch.full((1, 1, 48, 64), 5.0)
+    dot, haze = torch.zeros(1, 3, 48, 64), torch.full((1, 3, 48, 64), 1.0)
+    dot[..., 10, 50] = 1.0
+    covered = [torch.cat([t, t], 1) for t in (dot, haze, dot + haze)]
+    alone, without, within = (splat_bank(t, Labels(coc=coc), bank) for t in covered)
+    torch.testing.assert_close(alone, within - without, atol=1e-5, rtol=0)
+
+
+def test_a_disc_far_wider_than_the_picture_covers_it_evenly(bank: PsfBank) -> None:
+    image = torch.rand(1, 3, 12, 17, generator=torch.Generator().manual_seed(0))
+    labels = scene(12, 17, 1e4, 6.0, -3.0)
+    blur = KernelSplatting(bank=bank, quality="exact")
+    out = blur(image, labels.coc, motion=labels.motion)
+    torch.testing.assert_close(out, image.mean((2, 3), keepdim=True).expand_as(out), atol=2e-3, rtol=0)
+    near = KernelSplatting(quality="exact")(image, labels.coc)
+    torch.testing.assert_close(out, near, atol=2e-3, rtol=0)

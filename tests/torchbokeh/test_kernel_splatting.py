@@ -218,3 +218,11 @@ def test_one_radius_for_all_takes_a_single_convolution(radius: float, single: bo
     assert float(asked.grad.abs().max()) > 0
     coc[0, 0, 3, 4] += 0.1
     assert splatting.plan(image, coc).uniform is None
+
+
+@pytest.mark.parametrize("quality", NAMES)
+def test_radii_beyond_all_measure_leave_a_mean(quality: str) -> None:
+    image = torch.rand(1, 3, 16, 20, generator=torch.Generator().manual_seed(0))
+    for radius in (1e6, 1e30):
+        out = KernelSplatting(quality=quality)(image, torch.full((1, 1, 16, 20), radius))
+        torch.testing.assert_close(out, image.mean((2, 3), keepdim=True).expand_as(out), atol=1e-4, rtol=0)

@@ -344,3 +344,11 @@ def test_the_plan_says_that_radii_change() -> None:
             blur(picture(), coc=halves(4, 4), shutter_depth=wrong)
     with pytest.raises(ValueError, match="not a disc"):
         LensBlur(aperture="6-gon")(picture(), coc=halves(4, 4), shutter_depth=ends(2.0, 9.0))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_long_motion_in_half_precision(dtype: torch.dtype) -> None:
+    image, coc = torch.full((1, 3, 8, 9), 0.5, dtype=dtype), torch.full((1, 1, 8, 9), 2.0, dtype=dtype)
+    motion = torch.full((1, 2, 8, 9), 1024.0, dtype=dtype)
+    assert LensBlur().plan(image, coc=coc, motion=motion).motion == pytest.approx(1024 * 2**0.5)
+    assert torch.equal(LensBlur()(image, coc=coc, motion=motion), image)

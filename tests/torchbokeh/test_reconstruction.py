@@ -88,7 +88,7 @@ def test_scattered_samples_of_a_light_make_one_psf_not_two() -> None:
     again = one._replace(lens=flat.lens, time=flat.time)
     found = {name: l1(p, want) for name, p in (("one", reconstruct(one)), ("two", reconstruct(again)))}
     assert found["one"] < 0.25  # what is left is noise, of some 16 samples of the light
-    assert found["two"] > 0.6
+    assert found["two"] > 0.5
     assert l1(one.colour.mean(1), want) > 0.6
 
 

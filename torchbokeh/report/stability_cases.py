@@ -1,0 +1,161 @@
+"""Stiff and extreme pictures: dynamic range, radii, motions, sizes."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+HALF_MAX = 65504.0
+"""Largest value that float16 holds."""
+
+MEAN = 1.0
+"""Of the textured scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A picture to blur, in float64.
+
+    Attributes:
+        group: ``"dynamic range"``, ``"radius"``, ``"motion"`` or ``"size"``.
+        name: of it.
+        image: ``(B, C, H, W)``.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        motion: ``(B, 2, H, W)`` in px; ``None`` where renderers of motion take their own.
+        bright: places (y, x) of the highlights on an even background, whose leak is measured.
+        even: brightness of that background.
+        promised: whether the picture is of the kind for which a quality promises its error: the radius varies little
+            from pixel to pixel.
+    """
+
+    group: str
+    name: str
+    image: Tensor
+    coc: Tensor
+    motion: Tensor | None = None
+    bright: tuple[tuple[int, int], ...] = ()
+    even: float = MEAN
+    promised: bool = True
+    peak: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "peak", float(self.image.abs().max()) if self.image.numel() else 0.0)
+
+
+def texture(height: int, width: int, seed: int = 0, channels: int = 3) -> Tensor:
+    """A scene with a mean of about `MEAN` and a contrast of about 1: waves and noise, positive."""
+    draw = torch.Generator().manual_seed(seed)
+    y, x = torch.arange(height, dtype=torch.float64)[:, None], torch.arange(width, dtype=torch.float64)
+    waves = torch.stack([1 + 0.5 * torch.sin(0.3 * (k + 1) * x + 0.2 * y + k) for k in range(channels)])
+    noise = torch.rand(channels, height, width, dtype=torch.float64, generator=draw)
+    return (MEAN * waves * (0.5 + noise))[None]
+
+
+def slope(height: int, width: int, low: float, high: float) -> Tensor:
+    """CoC that runs from one value to another along the columns, ``(1, 1, H, W)``."""
+    return torch.linspace(low, high, width, dtype=torch.float64).expand(1, 1, height, width).contiguous()
+
+
+def even(height: int, width: int, radius: float) -> Tensor:
+    """The same CoC everywhere."""
+    return torch.full((1, 1, height, width), radius, dtype=torch.float64)
+
+
+def cases(side: int) -> Iterator[Case]:
+    """All pictures for renderers, of about ``side`` px each way."""
+    yield from dynamic_range(side)
+    yield from radii(side)
+    yield from motions(side)
+    yield from sizes(side)
+
+
+def dynamic_range(side: int) -> Iterator[Case]:
+    """One pixel of 1e2 to 1e8 beside black, grey and texture; a field of highlights; the least and largest numbers."""
+    group, at = "dynamic range", (side // 4, side // 3)
+    radius = side / 8
+    wide = slope(side, side, 0.9 * radius, radius)
+    for value in (1e2, 1e4, 1e6, 1e8):
+        for ground in (0.0, MEAN):
+            image = torch.full((1, 3, side, side), ground, dtype=torch.float64)
+            image[..., at[0], at[1]] = value
+            beside = "grey" if ground else "black"
+            yield Case(group, f"{value:.0e} beside {beside}", image, wide, bright=(at,), even=ground)
+        image = texture(side, side)
+        image[..., at[0], at[1]] = value
+        yield Case(group, f"{value:.0e} beside texture", image, wide)
+    image = texture(side, side)
+    image[..., ::3, ::3] = 1e4
+    yield Case(group, "a field of 1e4", image, wide)
+    image = torch.full((1, 3, side, side), MEAN, dtype=torch.float64)
+    image[..., at[0], at[1]] = HALF_MAX
+    yield Case(group, "65504 beside grey", image, wide, bright=(at,))
+    yield Case(group, "all 65504", torch.full((1, 3, side, side), HALF_MAX, dtype=torch.float64), wide)
+    yield Case(group, "denormal (1e-40)", texture(side, side) * 1e-40, wide)
+    yield Case(group, "all black", torch.zeros(1, 3, side, side, dtype=torch.float64), wide)
+
+
+def radii(side: int) -> Iterator[Case]:
+    """Even radii at the ends of ranges, and CoC that jumps at every pixel."""
+    group, image = "radius", texture(side, side)
+    for radius in (0.0, 1e-6, 0.49, 0.5, 0.51, 1 - 1e-4, 1 + 1e-4, 7 - 1e-4, 7 + 1e-4, 8.0, 1.5 * side, 1e4):
+        yield Case(group, f"even, {radius:.10g} px", image, even(side, side, radius))
+    yield Case(group, "even, -7.3 px", image, even(side, side, -7.3))
+    yield Case(group, "slope -9 to 9 px", image, slope(side, side, -9.0, 9.0))
+    chess = (torch.arange(side)[:, None] + torch.arange(side)) % 2 * torch.ones(1, 1, 1, 1, dtype=torch.float64)
+    yield Case(group, "-60 and 60 px by turns", image, 120 * chess - 60, promised=False)
+    yield Case(group, "0 and 40 px by turns", image, 40 * chess, promised=False)
+    draw = torch.Generator().manual_seed(1)
+    noise = torch.rand(1, 1, side, side, dtype=torch.float64, generator=draw)
+    yield Case(group, "noise up to 1e4 px", image, 1e4 * noise**8, promised=False)
+
+
+def motions(side: int) -> Iterator[Case]:
+    """No motion, hardly any, far more than the picture is wide, in opposite directions, along axes and diagonals."""
+    group, image, coc = "motion", texture(side, side), even(side, side, side / 16)
+    ways = {
+        "none": (0.0, 0.0),
+        "1e-6 px": (1e-6, 0.0),
+        "1.5 px": (1.5, 0.0),
+        "2000 px": (1600.0, 1200.0),
+        "along x": (side / 4, 0.0),
+        "along y": (0.0, -side / 4),
+        "diagonal": (side / 5, side / 5),
+    }
+    for name, way in ways.items():
+        motion = torch.tensor(way, dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
+        yield Case(group, name, image, coc, motion)
+    signs = torch.where((torch.arange(side) // 4) % 2 == 0, 1.0, -1.0).double()
+    opposite = torch.stack([signs * side / 4, 0 * signs])[:, None, :].expand(2, side, side)[None].contiguous()
+    yield Case(group, "opposite, side by side", image, slope(side, side, 0.5, side / 16), opposite)
+
+
+def sizes(side: int) -> Iterator[Case]:
+    """Pictures of one pixel, one row, one column, primes; none at all; one channel."""
+    group = "size"
+    for height, width in ((1, 1), (1, side), (side, 1), (2, 2), (3, 5), (31, 37)):
+        yield Case(group, f"{height} x {width}", texture(height, width), slope(height, width, -3.0, 5.0))
+    yield Case(group, f"5 x {8 * side}", texture(5, 8 * side), slope(5, 8 * side, 1.0, 30.0))
+    yield Case(group, "batch of 0", texture(5, 6)[:0], even(5, 6, 3.0)[:0])
+    yield Case(group, "one channel", texture(side, side, channels=1), slope(side, side, -3.0, 6.0))
+    pair = torch.cat([texture(side, side), 1e6 * texture(side, side, seed=1)])
+    coc = torch.cat([slope(side, side, 1.0, 5.0), slope(side, side, -5.0, 1.0)])
+    yield Case(group, "dark beside bright in a batch", pair, coc)
+
+
+def beyond(case: Case, reach: float, *, mirrored: bool) -> Tensor:
+    """Pixels ``(H, W)`` that are farther than ``reach`` px from every highlight of a case (and its mirror image)."""
+    height, width = case.image.shape[-2:]
+    y, x = torch.arange(height)[:, None], torch.arange(width)
+    far = torch.ones(height, width, dtype=torch.bool)
+    places = case.bright + tuple((v, width - 1 - u) for v, u in case.bright if mirrored)
+    for v, u in places:
+        far &= torch.hypot(y - v + 0.0 * x, x - u + 0.0 * y) > reach
+    return far
+
+
+def reach_of(case: Case, motion: Tensor | None) -> float:
+    """How far in px the PSFs of a case reach; 3 px more than the disc or capsule of any pixel."""
+    way = 0.0 if motion is None or not motion.numel() else float(motion.square().sum(1).sqrt().max())
+    return float(case.coc.abs().max()) + way / 2 + 3.0 if case.coc.numel() else math.inf

@@ -1,0 +1,174 @@
+"""What each mechanism is good for: the error without it, and with it, in float32."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchbokeh import bank_splatting
+from torchbokeh._signed import WIDEST
+from torchbokeh.integration import FFTIntegrator, PyramidIntegrator
+from torchbokeh.kernel_splatting import KernelSplatting
+from torchbokeh.ops.convolve import convolve
+from torchbokeh.ops.dense import dense_spans
+from torchbokeh.ops.integrate import laplacian, poisson_fft
+from torchbokeh.ops.splat import splat_spans
+from torchbokeh.psfs.aperture import Disc
+from torchbokeh.psfs.combined import capsule
+from torchbokeh.psfs.refit import drawn
+from torchbokeh.report.stability_cases import even, slope
+from torchbokeh.report.stability_renderers import bank_of
+
+Mechanism = dict[str, Any]
+
+
+def _row(mechanism: str, case: str, without: float, kept: float) -> Mechanism:
+    return {"mechanism": mechanism, "case": case, "without": float(without), "with": float(kept)}
+
+
+def mechanism_rows(side: int) -> Iterator[Mechanism]:
+    """All of them, on pictures of about ``side`` px; errors are absolute, on a ground of 1, if nothing else is said."""
+    yield _running_sum(side)
+    yield _convolution(side)
+    yield from _highlights(side)
+    yield _moments()
+    yield from _integrals(side)
+    yield from _normalisation(side)
+    yield _reciprocals()
+    yield _confined(side)
+
+
+def _lit(side: int) -> Tensor:
+    image = torch.ones(1, 1, side, side)
+    image[..., side // 4, side // 3] = 1e6 / 3
+    return image
+
+
+def _far(side: int, radius: float) -> Tensor:
+    y, x = torch.arange(side)[:, None] - side // 4, torch.arange(side) - side // 3
+    return torch.hypot(y + 0.0 * x, x + 0.0 * y) > radius + 3
+
+
+def _running_sum(side: int) -> Mechanism:
+    """One splat of a highlight, its differences summed in float32 and in double."""
+    radius, profile = side / 8, Disc().profile()
+    image, coc = _lit(side), slope(side, side, 0.9 * radius, radius).float()
+    single = splat_spans(image, coc, profile).numpy().cumsum(-1, dtype=np.float32)
+    double = splat_spans(image, coc, profile, integrate=True)
+    want, far = dense_spans(image, coc, profile), _far(side, radius)
+    errors = ((t.double() - want)[..., far].abs().max() for t in (torch.from_numpy(single), double))
+    return _row("running sums in double", "far-field leak of 3e5", *(float(e) for e in errors))
+
+
+def _convolution(side: int) -> Mechanism:
+    """One convolution with a disc, by FFT in float32 and in double."""
+    disc = torch.from_numpy(capsule(side / 8, 0.0))[None].float()
+    image, far = _lit(side), _far(side, side / 8)
+    size = [2 * side, 2 * side]
+    reach = disc.shape[2] // 2
+    product = torch.fft.rfft2(image, s=size) * torch.fft.rfft2(disc, s=size)
+    single = torch.fft.irfft2(product, s=size)[..., reach : reach + side, reach : reach + side]
+    want = convolve(image.double(), disc.double())
+    errors = ((t.double() - want)[..., far].abs().max() for t in (single, convolve(image, disc)))
+    return _row("FFT of an even blur in double", "far-field leak of 3e5", *(float(e) for e in errors))
+
+
+def _highlights(side: int) -> Iterator[Mechanism]:
+    """Highlights through sparse PSFs like all pixels, and drawn by themselves."""
+    for name, motion in (("combined", (6.0, -3.0)), ("physical-lens", None)):
+        bank = bank_of(name)
+        splatting = KernelSplatting(quality="exact", bank=bank)
+        image = _lit(side).expand(1, 3, side, side).clone()
+        coc, plain = even(side, side, side / 20).float(), torch.ones_like(image)
+        way = None if motion is None else torch.tensor(motion).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
+        far = _far(side, 9.0 * side / 20)
+        leaks = []
+        for most in (0, bank_splatting.MOST):
+            with mock.patch.object(bank_splatting, "MOST", most):
+                lit, dark = splatting(image, coc, motion=way), splatting(plain, coc, motion=way)
+            leaks.append(float((lit - dark)[..., far].abs().max()))
+        yield _row(f"highlights in the direct domain, bank {name}", "far-field leak of 3e5", *leaks)
+    image, at = torch.ones(1, 3, side, side), (side // 4, side // 3)
+    image[..., at[0] - 2 : at[0] + 3, at[1] - 2 : at[1] + 3] = 1e6 / 3
+    coc = even(side, side, side / 5).float()
+    way = torch.full((1, 2, side, side), side / 12)
+    splatting, plain, leaks = KernelSplatting(quality="exact", bank=bank_of("combined")), torch.ones_like(image), []
+    far = _far(side, side / 3)
+    for clipped in (0, bank_splatting.CLIPPED):
+        with mock.patch.object(bank_splatting, "CLIPPED", clipped):
+            lit, dark = splatting(image, coc, motion=way), splatting(plain, coc, motion=way)
+        leaks.append(float((lit - dark)[..., far].abs().max()))
+    yield _row("a mean without highlights to find them by", "far-field leak of 25 times 3e5", *leaks)
+
+
+def _moments() -> Mechanism:
+    """A sparse Laplacian whose values are rounded to half precision, so that its moments do not vanish any more."""
+    bank = bank_of("combined")
+    chosen = (bank.domains == 2).nonzero()[-1]
+    sparse = bank.sample(int(chosen)).sparse
+    reach = int(np.abs(sparse.points).max())
+    rounded = sparse._replace(values=sparse.values.astype(np.float16).astype(np.float64))
+    leaks = []
+    for s in (rounded, sparse):
+        field = poisson_fft(torch.from_numpy(drawn(s, (2 * reach + 1,) * 2))[None], compact=False)[0, 0]
+        leaks.append(float(field[0].abs().max() / field.abs().max()))
+    return _row("moments of sparse PSFs that vanish", "relative, at twice the half side", *leaks)
+
+
+def _integrals(side: int) -> Iterator[Mechanism]:
+    """Laplacians that do not sum to 0, on a torus and in free space; the pyramid beside the FFT."""
+    point = torch.zeros(1, 1, side, side)
+    point[..., side // 2, side // 2] = 1.0
+    free = poisson_fft(point.double(), compact=False)
+    errors = [float((FFTIntegrator(compact=c)(point).double() - free).abs().max()) for c in (True, False)]
+    yield _row("free space, not a torus", "a Laplacian that sums to 1", *errors)
+    with torch.no_grad():
+        pyramid = float((PyramidIntegrator()(point).double() - free).abs().max())
+    yield _row("FFT, not the pyramid", "a Laplacian that sums to 1", pyramid, errors[1])
+    y, x = torch.arange(side)[:, None] - side / 2, torch.arange(side) - side / 2
+    disc = (torch.hypot(y + 0 * x, x + 0 * y) < side / 4).float()[None, None]
+    with torch.no_grad():
+        both = [float((i(laplacian(disc)) - disc).abs().max()) for i in (PyramidIntegrator(), FFTIntegrator(True))]
+    yield _row("FFT, not the pyramid", "a disc of 1", *both)
+
+
+def _normalisation(side: int) -> Iterator[Mechanism]:
+    """The coverage under what was spread, for a constant under a blur that jumps; and radii beyond all measure."""
+    coc = slope(side, side, 0.0, 30.0).float() * (torch.arange(side) % 2)
+    image, profile = torch.ones(1, 1, side, side), Disc().profile()
+    sums = splat_spans(image, coc, profile, integrate=True)
+    splatting = KernelSplatting(quality="exact")
+    off = [float((t - 1).abs().max()) for t in (sums, splatting(image, coc))]
+    yield _row("division by coverage", "a constant, radii that jump", *off)
+    holes = splat_spans(image, even(side, side, 1e8).float(), profile, integrate=True)
+    kept = splatting(image, even(side, side, 1e8).float())
+    lost = torch.where(holes < bank_splatting.TINY, 0.0, holes / holes)
+    yield _row(
+        f"radii cut to {WIDEST:g} px",
+        "a constant, radius 1e8",
+        float((lost - 1).abs().max()),
+        float((kept - 1).abs().max()),
+    )
+
+
+def _reciprocals() -> Mechanism:
+    """The defocus equation as printed, and in reciprocal distances, for the sky: parts that are not finite."""
+    depth, focus = torch.tensor([1.0, 1e20, math.inf]), 2.0
+    printed, kept = (depth - focus) / depth / focus, 1 / focus - depth.reciprocal()
+    return _row(
+        "reciprocal distances", "CoC that is not finite", *(float((~t.isfinite()).sum()) for t in (printed, kept))
+    )
+
+
+def _confined(side: int) -> Mechanism:
+    """Pixels of a buffer around the discs of motion that are far wider than the picture, in millions."""
+    wide, enough = 1e4, 1.5 * 6 + math.hypot(side, side) + 1
+    return _row(
+        "discs no wider than the picture asks for",
+        "Mpx of a buffer, radius 1e4",
+        *(4e-6 * r**2 for r in (wide, enough)),
+    )
