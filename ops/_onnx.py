@@ -41,7 +41,7 @@ def splat_rows(
     height = op.Squeeze(op.Slice(shape, [2], [3]))
     width = op.Squeeze(op.Slice(shape, [3], [4]))
     flat = op.Reshape(
-        op.Transpose(values, perm=[0, 2, 3, 1]), op.Concat(op.Constant(value_ints=[-1]), channels, axis=0)
+        op.Transpose(values, perm=[1, 0, 2, 3]), op.Concat(channels, op.Constant(value_ints=[-1]), axis=0)
     )
     signed = op.Reshape(coc, [-1])
     radius = op.Where(op.Less(signed, zero), op.Neg(op.Max(op.Abs(signed), half)), op.Max(op.Abs(signed), half))
@@ -59,7 +59,7 @@ def splat_rows(
     last = op.Size(heights) - 2
     halvings = op.Size(strides)
     cells = op.Div(count, width) * (width + 2)
-    buffer = op.Expand(zero, op.Concat(op.Reshape(cells, [1]), channels, axis=0))
+    buffer = op.Expand(zero, op.Concat(channels, op.Reshape(cells, [1]), axis=0))
     for k in range(2 * reach + 1):
         row = k - reach
         offset = op.Cast(row, to=DOUBLE.dtype)
@@ -100,7 +100,7 @@ def splat_rows(
         left_edge = r * (op.Squeeze(op.Slice(straight, [0], [1], [1]), [1]) - round_part)
         right_edge = r * (op.Squeeze(op.Slice(straight, [1], [2], [1]), [1]) + round_part)
         weight = op.Where(op.Greater(covered, tiny), covered, zero) / (op.Abs(r) * whole)
-        share = op.Gather(flat, pixels) * op.Unsqueeze(weight, [1])
+        share = op.Gather(flat, pixels, axis=1) * weight
         base = (op.Div(pixels, width) + row) * (width + 2)
         here = op.Gather(x, pixels)
         wide = op.Cast(width, to=DOUBLE.dtype)  # here: outside, onnxruntime warns that it cannot optimise it away
@@ -110,13 +110,14 @@ def splat_rows(
         right_column = op.Floor(right)
         left_index = base + op.Cast(left_column, to=INT64.dtype)
         right_index = base + op.Cast(right_column, to=INT64.dtype)
-        left_next = share * op.Unsqueeze(left - left_column, [1])
-        right_next = share * op.Unsqueeze(right - right_column, [1])
+        left_next = share * (left - left_column)
+        right_next = share * (right - right_column)
         index = op.Concat(left_index, left_index + 1, right_index, right_index + 1, axis=0)
-        update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=0)
-        buffer = op.ScatterND(buffer, op.Unsqueeze(index, [1]), update, reduction="add")
-    padded = op.Concat(op.Slice(shape, [0], [1]), op.Reshape(height, [1]), op.Reshape(width + 2, [1]), channels, axis=0)
-    planes = op.Transpose(op.Reshape(buffer, padded), perm=[0, 3, 1, 2])
+        update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=1)
+        # Not ScatterND: the threads of onnxruntime lose some of what it adds to one place.
+        buffer = op.ScatterElements(buffer, op.Expand(index, op.Shape(update)), update, axis=1, reduction="add")
+    padded = op.Concat(channels, op.Slice(shape, [0], [1]), op.Reshape(height, [1]), op.Reshape(width + 2, [1]), axis=0)
+    planes = op.Transpose(op.Reshape(buffer, padded), perm=[1, 0, 2, 3])
     return op.Slice(planes, [0], op.Reshape(width, [1]), [3])
 
 

@@ -57,7 +57,7 @@ def _rows(name: str, path: Path, settings: Settings) -> list[Row]:
     inputs: dict[int, tuple[Tensor, ...]]
     start = time.perf_counter()
     if name == PYRAMID:
-        label, pyramid = PYRAMID, torchbokeh.PyramidIntegrator()
+        label, pyramid = PYRAMID, torchbokeh.PyramidIntegrator(levels=13)
         inputs = {size: (pyramid.differentiate(seen.image),) for size, seen in pictures.items()}
         eager = {size: partial(pyramid, *given) for size, given in inputs.items()}
         export_onnx(pyramid, path, *inputs[max(pictures)])

@@ -75,7 +75,7 @@ class Settings:
     gradient_sizes: tuple[int, ...] = (256, 512, 1024)
     gradient_radii: tuple[float, ...] = (12.0, 50.0)
     gradient_memory: float = 6e9
-    export_qualities: tuple[str, ...] = ("exact", "balanced", "fast")
+    export_qualities: tuple[str, ...] = ("balanced", "fast")
     export_sizes: tuple[int, ...] = (256, 512)
     chromatic_scenes: tuple[str, ...] = ("coins", "ramp")
     chromatic_strengths: tuple[tuple[float, float], ...] = ((0.5, 0.0), (0.0, 0.03), (0.5, 0.03))
