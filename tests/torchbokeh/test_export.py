@@ -144,7 +144,9 @@ def test_splats_add_up_whatever_the_radius(aperture, tmp_path):
         image[..., 0, 0] = 1e6
         signed = radius * (2 * torch.rand(batch, 1, height, width, generator=generator) - 1)
         signed[..., 0, 0] = radius
-        assert_same(run(loaded, image, signed), splatting(image, signed))
+        # Angles are float32, 6e-8: on the rim of the highlight, where nearly nothing of it is left, that is seen.
+        found, wanted = run(loaded, image, signed), splatting(image, signed)
+        torch.testing.assert_close(found, wanted, rtol=3e-5, atol=1e-8 * 1e6)
 
 
 @pytest.mark.slow
