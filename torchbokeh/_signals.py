@@ -31,14 +31,24 @@ def end_while_importing() -> None:
 @contextmanager
 def stoppable() -> Iterator[None]:
     """Raise KeyboardInterrupt in the block on Ctrl-C, and :class:`Terminated` on SIGTERM, unless others handle them."""
-    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
+    errors: dict[int, type[BaseException]] = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
+    came: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        raise errors[number]
+
     before = {}
     if _is_main_thread():
-        for number, handler in handlers.items():
-            if signal.getsignal(number) in (signal.SIG_DFL, _end):
-                before[number] = signal.signal(number, handler)
+        for number in errors:
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler, _end):
+                before[number] = signal.signal(number, stop)
     try:
         yield
+    except Exception as error:
+        if came:  # compiled code that a signal comes in the middle of may make another error of it
+            raise errors[came[0]] from error
+        raise
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
@@ -51,7 +61,3 @@ def _is_main_thread() -> bool:
 def _end(number: int, frame: FrameType | None) -> None:
     os.write(2, b"torchbokeh: interrupted\n")
     os._exit(130)
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise Terminated

@@ -72,7 +72,7 @@ class Settings:
     layer_counts: tuple[int, ...] = (1, 2, 4, 8, 16)
     motion_size: int = 1024
     motions: tuple[tuple[float, float], ...] = ((25.0, 40.0), (60.0, 120.0))
-    gradient_sizes: tuple[int, ...] = (256, 512, 1024)
+    gradient_sizes: tuple[int, ...] = (256, 512)
     gradient_radii: tuple[float, ...] = (12.0, 50.0)
     gradient_memory: float = 6e9
     export_qualities: tuple[str, ...] = ("balanced", "fast")

@@ -98,7 +98,7 @@ def renderers() -> Iterator[Renderer]:
         yield Renderer(
             f"KernelSplatting, {quality.name}", kind, partial(_still, splatting), dense, plan, quality=quality.name
         )
-    for name in ("exact", "balanced"):
+    for name in (quality.name for quality in QUALITIES):
         blur = LensBlur(quality=name)
         for what, call, kind in (("image", _image, "composed"), ("layers", _layered, "layers")):
             run = partial(call, blur)
