@@ -84,14 +84,5 @@ def _blur_surface_op(
 
 
 @_blur_surface_op.register_fake
-def _(
-    colour: Tensor,
-    coc: Tensor,
-    weights: Sequence[Tensor | None],
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
-    highest: int,
-) -> list[Tensor]:
+def _(colour: Tensor, coc: Tensor, *settings: object) -> list[Tensor]:
     return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (colour, coc)]

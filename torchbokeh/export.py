@@ -90,12 +90,13 @@ def export_onnx(module: nn.Module, path: str | Path, *inputs: Tensor, plan: Plan
 
 
 class _Traced(NamedTuple):
-    """A module, what it is called with, and how that and what it returns are named in the file."""
+    """A module, what it is called with, how that and what it returns are named in the file, and px that it cuts off."""
 
     module: nn.Module
     inputs: tuple[Tensor, ...]
     names: tuple[str, ...]
     result: str
+    margin: int = 0
 
 
 class _Blur(nn.Module):
@@ -165,15 +166,18 @@ def _renderer(module: LensBlur | KernelSplatting, inputs: tuple[Tensor, ...], pl
     if isinstance(plan, Plan) and (plan.colours or plan.moves):
         raise ValueError("plan: expected one without dispersion and motion, which are not exported, got one with them")
     bare: nn.Module
+    margin = 0
     if isinstance(module, LensBlur):
         assert isinstance(plan, Plan)
-        bare = _Blur(module, plan)
+        depth_map, coc = (None, inputs[1]) if lens is None else (inputs[1], None)
+        module._check_plan(plan, module._inputs(inputs[0], depth_map, coc, (None, None), None)[0])
+        bare, margin = _Blur(module, plan), module.margin
     else:
         assert isinstance(plan, SplattingPlan)
         bare = _Splatting(module, plan)
     names = next((given for kind, given in INPUTS.items() if isinstance(lens, kind)), ())
     values = (getattr(lens, name).detach() for name in names)
-    return _Traced(_Call(bare, names), (*inputs, *values), ("image", name, *names), "blurred")
+    return _Traced(_Call(bare, names), (*inputs, *values), ("image", name, *names), "blurred", margin)
 
 
 def _translated(traced: _Traced) -> "ModelProto":
@@ -188,8 +192,8 @@ def _translated(traced: _Traced) -> "ModelProto":
         # A map, the value of every picture in a batch, or one for all.
         dims = (0, given.dim() - 2, given.dim() - 1) if given.dim() > 1 else (0,) * given.dim()
         sizes = list(given.shape)
-        for dim, size in zip(dims, _SIZE, strict=False):
-            sizes[dim] = size
+        for dim, size, cut in zip(dims, _SIZE, (0, traced.margin, traced.margin), strict=False):
+            sizes[dim] = size + 2 * cut
         arguments.append(given.new_ones(sizes))
         open_sizes.append(dict.fromkeys(dims, Dim.DYNAMIC) or None)
     with _quiet(), torch.no_grad(), definitions_only():

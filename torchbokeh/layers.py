@@ -361,17 +361,7 @@ def _foreground_over_rest_op(
 
 
 @_foreground_over_rest_op.register_fake
-def _(
-    image: Tensor,
-    coc: Tensor,
-    ahead: Sequence[float],
-    behind: Sequence[float],
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
-    highest: int,
-) -> Tensor:
+def _(image: Tensor, *settings: object) -> Tensor:
     return torch.empty_like(image, memory_format=torch.contiguous_format)
 
 

@@ -12,8 +12,7 @@ from torch import Tensor
 import torchbokeh as tb
 from torchbokeh.export import export_onnx
 from torchbokeh.integration import Integrator
-from torchbokeh.ops._dispatch import definitions_only
-from torchbokeh.ops.merge import Merging
+from torchbokeh.ops._dispatch import definitions_only, only_definitions
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs import Disc, Ellipse, Polygon
 
@@ -162,10 +161,10 @@ def test_layers_with_a_lens_for_each_picture(tmp_path):
     assert_same(run(loaded, layers, disparity, lens.strength, lens.focus_disparity), wanted)
 
 
-def test_coc_in_place_of_a_lens(tmp_path):
-    blur = tb.LensBlur(layers=1, subapertures=1)
-    image = scene(1, 24, 32)[0]
-    coc = torch.linspace(-6, 9, 32).repeat(1, 1, 24, 1)
+def test_coc_in_place_of_a_lens_and_a_wide_margin(tmp_path):
+    blur = tb.LensBlur(layers=1, subapertures=1, margin=36)
+    image = scene(1, 96, 104)[0]
+    coc = torch.linspace(-6, 9, 104).repeat(1, 1, 96, 1)
     loaded = session(export_onnx(blur, tmp_path / "coc.onnx", image, coc))
     assert [i.name for i in loaded.get_inputs()] == ["image", "coc"]
     assert_same(run(loaded, image, coc), blur(image, coc=coc))
@@ -185,10 +184,12 @@ def test_integrators_at_other_sizes(integrator: Integrator, tmp_path):
         torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-3)
 
 
-def test_definitions_only_says_so_and_changes_little():
+def test_definitions_change_little():
     image, coc = torch.rand(1, 3, 24, 32), torch.linspace(-20, 20, 32).repeat(1, 1, 24, 1)
     splatting = tb.KernelSplatting(quality="balanced")
+    assert not only_definitions()
     with definitions_only():
+        assert only_definitions()
         slow = splatting(image, coc)
     torch.testing.assert_close(slow, splatting(image, coc), rtol=1e-4, atol=1e-5)
 
@@ -215,6 +216,14 @@ def moved(blur: tb.LensBlur) -> tb.Plan:
             ValueError,
             "plan: expected one of a scene whose blur varies",
         ),
+        (
+            (tb.LensBlur(thin_lens()), *scene(1, 24, 32)),
+            tb.LensBlur(thin_lens()).plan(
+                torch.ones(1, 2, 4, 24, 32), scene(1, 24, 32)[1][:, None].repeat(1, 2, 1, 1, 1)
+            ),
+            ValueError,
+            "plan: expected one for 0 layers, got one for 2",
+        ),
         ((tb.LensBlur(thin_lens()), *scene(1, 24, 32)), moved(tb.LensBlur(thin_lens())), ValueError, "and motion"),
     ],
 )
@@ -235,4 +244,3 @@ def test_merging_is_in_the_file(exported):
     """The plan of the merged quality has more than one level: else the test above would not see it."""
     blur, plan, _, _ = exported
     assert (plan.highest > 0) == (blur.quality == "balanced")
-    assert plan.quality.merging is None or isinstance(plan.quality.merging, Merging)
