@@ -36,6 +36,33 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def replacing_together(folder: Path, last: str) -> Iterator[Path]:
+    """Yield a temporary folder whose files move into ``folder`` when the block ends without an error.
+
+    Args:
+        folder: an existing folder; files of the same names are replaced.
+        last: the one of the files that speaks of the others. It moves last, and while others move there is none of
+            this name: whenever it is there, so is what it speaks of.
+
+    Raises:
+        OSError: the block raised one, or a file cannot be moved; the message names ``folder``.
+
+    Example:
+        >>> with replacing_together(Path("."), "all.md") as temporary:  # doctest: +SKIP
+        ...     (temporary / "plot.png").write_bytes(b"...")
+        ...     (temporary / "all.md").write_text("![plot](plot.png)")
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix=".torchbokeh-", dir=folder) as made:
+            yield Path(made)
+            (folder / last).unlink(missing_ok=True)
+            for name in sorted(os.listdir(made), key=last.__eq__):
+                os.replace(Path(made, name), folder / name)
+    except OSError as error:
+        raise OSError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
 def check_place(path: Path) -> None:
     """Raise a ValueError where no file can be written under a name, before there is anything to write."""
     if path.is_dir():

@@ -30,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the arguments after the program's name; None takes those of the process.
 
     Returns:
-        The exit status: 0, 2 after one line on stderr that says what was wrong, 130 after Ctrl-C, or 143 after
-        SIGTERM.
+        The exit status: 0, 2 after one line on stderr that says what was wrong, 130 after Ctrl-C, 143 after SIGTERM,
+        or 141 where nobody reads what is printed, as after ``| head``.
 
     Raises:
         SystemExit: with status 0, after ``--help`` and ``--version``.
@@ -40,8 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         >>> main(["render", "a.png", "--depth", "d.npy", "--focus", "2m", "-o", "b.png"])  # doctest: +SKIP
         0
     """
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a file name may be no text
+    _open_streams()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file name may be no text; and unbuffered, `_flush` saw no error
+        sys.stdout.reconfigure(errors="backslashreplace", write_through=False)
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # what is wrong with a file is said once
     try:
         with stoppable():
@@ -57,12 +58,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     except torch.OutOfMemoryError:
         print("torchbokeh: the GPU is out of memory; use --device cpu or a smaller picture", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        return 141
     except (ValueError, OSError) as error:
         print("torchbokeh:", " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    finally:
         with suppress(OSError):
             _flush()
-        return 2
     return 0
+
+
+def _open_streams() -> None:
+    """Put the null device where a standard stream is closed: `print` would write errors to the other one."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
 
 
 def _flush() -> None:
@@ -70,6 +81,8 @@ def _flush() -> None:
         sys.stdout.flush()
     except OSError as error:  # a full disk, or nobody who reads
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter tries, and complains, again
+        if isinstance(error, BrokenPipeError):
+            raise
         raise OSError(f"standard output: cannot be written ({error.strerror})") from error
 
 
@@ -82,6 +95,11 @@ class _Parser(argparse.ArgumentParser):
             if re.fullmatch("-[^=]*=--", text):
                 self.error(f"argument {text[:-3]}: expected one argument")
         return super().parse_known_args(args, namespace)
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """End after ``--help`` or ``--version``, unless that could not be written."""
+        _flush()
+        super().exit(status, message)
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see: {self.prog} --help)")

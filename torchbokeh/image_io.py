@@ -5,7 +5,6 @@ Integer samples are sRGB-encoded and are decoded to linear light; floating-point
 
 import io
 import struct
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -242,24 +241,25 @@ def _load(path: Path, prefer: str = "") -> np.ndarray:
 
 
 def _read_png_jpeg(path: Path) -> np.ndarray:
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
 
     data = path.read_bytes()  # a decoder that is told to read more than there is then gets no more
+    is_png = data.startswith(_PNG_SIGNATURE)
     depth, colour = 8, 2
-    if data.startswith(_PNG_SIGNATURE) and len(data) >= 26:
+    if is_png and len(data) >= 26:
         width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
         _check_claim(len(data), height, width, depth * {2: 3, 4: 2, 6: 4}.get(colour, 1), _DEFLATE)
     if depth == 16 and colour in (2, 6):  # Pillow keeps 8 of the 16 bits of a colour PNG
         from kornia_rs.io import read_image_png_u16
 
         return np.asarray(read_image_png_u16(str(path), "rgb" if colour == 2 else "rgba"))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is that of `check_pixels`
-        opened = Image.open(io.BytesIO(data), formats=("PNG", "JPEG"))
-    with opened:
-        if opened.format == "JPEG":  # a block of 8 x 8 samples takes at least a bit
+    # `Image.open` warns of pictures that `check_pixels` allows, and a filter of warnings is one of all threads.
+    with PngImageFile(io.BytesIO(data)) if is_png else JpegImageFile(io.BytesIO(data)) as opened:
+        if not is_png:  # a block of 8 x 8 samples takes at least a bit
             _check_claim(len(data), opened.height, opened.width, 8 * len(opened.getbands()), _DEFLATE)
-        image: Image.Image = ImageOps.exif_transpose(opened)
+        image = ImageOps.exif_transpose(opened)
         if depth == 16 and colour == 0:
             return np.asarray(image).astype(np.uint16)
         if depth == 16 or image.mode == "CMYK":

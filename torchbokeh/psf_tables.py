@@ -1,13 +1,11 @@
 """``psfs.md``: the tables of an analysis of sparse PSFs, and what a reader has to know about them."""
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchbokeh.image_io import replacing
 from torchbokeh.psf_analysis import METHODS, SHARES, SPARSITY
 from torchbokeh.report.markdown import table
 
@@ -18,7 +16,7 @@ THICK = 4
 
 
 def write_analysis(found: dict[str, Any], folder: Path) -> list[Path]:
-    """Write ``psfs.md``, ``psfs.json`` and plots, each whole or not at all.
+    """Write ``psfs.md``, ``psfs.json`` and plots, all of them or none.
 
     Args:
         found: what `torchbokeh.psf_analysis.analyse` returns.
@@ -28,17 +26,9 @@ def write_analysis(found: dict[str, Any], folder: Path) -> list[Path]:
         The files written, ``psfs.md`` first.
     """
     from torchbokeh.psf_plots import draw
-    from torchbokeh.report.write import DPI
+    from torchbokeh.report.write import write_together
 
-    figures = draw(found["experiments"])
-    for name, figure in figures.items():
-        with replacing(folder / name) as temporary:
-            figure.savefig(temporary, dpi=DPI)
-    with replacing(folder / "psfs.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with replacing(folder / "psfs.md") as temporary:
-        temporary.write_text(markdown(found), encoding="utf-8")
-    return [folder / "psfs.md", folder / "psfs.json", *(folder / name for name in figures)]
+    return write_together(folder, "psfs", markdown(found), found, draw(found["experiments"]))
 
 
 def markdown(found: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, SIGKILL and full disks: one line, no worker left, nothing half-written that looks whole."""
+"""Ctrl-C, SIGTERM and SIGKILL: one line, no worker left, nothing half-written that looks whole."""
 
 import os
 import re
@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ SMALL = """
 import sys
 from functools import partial
 sys.argv[0] = "torchbokeh"
-from torchbokeh.cli import main
 from torchbokeh.psfs import SimpleLens
 from torchbokeh.psfs.models import MODELS
 MODELS["simple-lens"] = partial(SimpleLens, radius=3.0)
@@ -36,6 +36,7 @@ sys.exit(main())
 """
 
 RENDER = ("render", "image.tif", "--depth", "depth.npy", "--focus", "2m", "--f-number", "0.1", "-o", "out.tif")
+SHARP = (*RENDER, "--f-number", "16")
 DATASET = ("dataset", "--out", "set", "--count", "8", "--per-shard", "2", "--size", "64x48", "--views", "512")
 BUILD = ("psfs", "build", "simple-lens", "--out", "bank.safetensors")
 COMMANDS = {
@@ -124,10 +125,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.3, 2.5, 6.0])
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_ctrl_c_at_any_moment(folder: Path, command: tuple[str, ...], seconds: float) -> None:
-    process = start(folder, *command)
+@pytest.mark.parametrize(
+    ("command", "seconds"),
+    [(name, seconds) for name in COMMANDS for seconds in ((2.5,) if name in ("show", "table") else (2.5, 6.0))],
+)
+def test_ctrl_c_at_any_moment(folder: Path, command: str, seconds: float) -> None:
+    """While the package is imported, and after that: these commands take longer, but for two."""
+    process = start(folder, *COMMANDS[command])
     time.sleep(seconds)
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGINT)
@@ -140,7 +144,7 @@ def test_ctrl_c_at_any_moment(folder: Path, command: tuple[str, ...], seconds: f
     for name in written(folder):
         assert "/." not in name
         if not name.startswith(("bank.safetensors.parts/", "set/")):
-            assert command[0] == "demo"  # which writes several pictures
+            assert command == "demo"  # which writes several pictures
             read_image(folder / name)
 
 
@@ -163,18 +167,23 @@ def test_ctrl_c_while_importing(tmp_path: Path) -> None:
         assert (lines, process.returncode) == (["torchbokeh: interrupted"], 130), script
 
 
+ENDS = [
+    (True, signal.SIGINT, 130, ["torchbokeh: interrupted"]),
+    (False, signal.SIGINT, 130, ["torchbokeh: interrupted"]),
+    (False, signal.SIGTERM, 143, ["torchbokeh: terminated"]),
+    (True, signal.SIGKILL, -9, None),
+    (False, signal.SIGKILL, -9, None),
+]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("to_all", "number", "status", "line"),
+    ("command", "to_all", "number", "status", "line"),
     [
-        (True, signal.SIGINT, 130, ["torchbokeh: interrupted"]),
-        (False, signal.SIGINT, 130, ["torchbokeh: interrupted"]),
-        (False, signal.SIGTERM, 143, ["torchbokeh: terminated"]),
-        (True, signal.SIGKILL, -9, None),
-        (False, signal.SIGKILL, -9, None),
+        *((DATASET, *end) for end in ENDS if not end[0]),  # without workers there is nobody else
+        *(((*command, "--workers", "2"), *end) for command in (DATASET, BUILD) for end in ENDS),
     ],
 )
-@pytest.mark.parametrize("command", [DATASET, (*DATASET, "--workers", "2"), (*BUILD, "--workers", "2")])
 def test_a_second_run_goes_on(
     tmp_path: Path,
     whole: dict[str, bytes],
@@ -214,88 +223,29 @@ def test_a_killed_worker(tmp_path: Path, command: tuple[str, ...]) -> None:
     assert "perhaps for want of memory" in lines[0]
 
 
-WRITERS = """
-import resource, sys, warnings
-from pathlib import Path
-import matplotlib; matplotlib.use("agg")
-import torch
-from matplotlib.figure import Figure
-import torchbokeh as tb
-from torchbokeh.image_io import replacing, write_image
-from torchbokeh.report.sheets import write_sheet
-from torchbokeh.scenes.shards import write_shards
-
-def figure(path):
-    with replacing(path) as temporary:
-        Figure().savefig(temporary)
-
-def text(path):
-    with replacing(path) as temporary:
-        temporary.write_text("x" * 10000)
-
-image, bank = torch.rand(1, 3, 40, 50), tb.PsfBank.load("combined")
-dataset = tb.scenes.ProceduralDataset(resolution=(16, 24), length=2, views=4)
-writers = {
-    "a.png": lambda path: write_image(path, image),
-    "a.tif": lambda path: write_image(path, image),
-    "a.exr": lambda path: write_image(path, image),
-    "sheet.png": lambda path: write_sheet(path, [("grey", image)]),
-    "plot.png": figure,
-    "report.md": text,
-    "bank.safetensors": bank.save,
-    "shard-000000.tar": lambda path: write_shards(dataset, path.parent, 2, show_progress=False),
-}
-for name, write in writers.items():
-    path = Path(name)
-    write(path)
-    size = path.stat().st_size
-    for limit in (0, 1, size // 2, size - 1):
-        path.unlink(missing_ok=True)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-        if limit < 500 and "shard" in name:  # not even what says of what the set is
-            Path("dataset.json").unlink()
-        try:
-            write(path)
-            found = "NO ERROR"
-        except OSError as error:
-            found = str(error)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        print(name, limit, found, sorted(p.name for p in Path().iterdir()), sep="|")
-        write_shards(dataset, ".", 2, show_progress=False) if "shard" in name and limit < 500 else None
-    path.unlink(missing_ok=True)
-    Path("dataset.json").unlink(missing_ok=True)
-"""
-
-
 @pytest.mark.slow
-def test_a_full_disk(tmp_path: Path) -> None:
-    """The limit on the size of a file stands for the disk: writing fails with an error in the middle of a file."""
-    done = subprocess.run(
-        [sys.executable, "-c", WRITERS], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE
-    )
-    assert done.returncode == 0, done.stderr
-    lines = [line.split("|") for line in done.stdout.splitlines()]
-    assert len(lines) == 4 * 8
-    for name, limit, error, files in lines:
-        where = "dataset.json" if name.startswith("shard") and int(limit) < 2 else name
-        assert error == f"{where}: cannot be written (File too large)", (name, limit)
-        assert files in ("[]", "['dataset.json']"), (name, limit)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("target", ["/dev/full", "a pipe that nobody reads"])
-def test_full_standard_output(folder: Path, target: str) -> None:
-    read, write = (None, os.open(target, os.O_WRONLY)) if target == "/dev/full" else os.pipe()
-    if read is not None:
-        os.close(read)
-    try:
-        process = start(folder, *RENDER, stdout=write)
-    finally:
+@pytest.mark.parametrize(
+    ("command", "target", "status", "line"),
+    [
+        (("--help",), "/dev/full", 2, ["torchbokeh: standard output: cannot be written (No space left on device)"]),
+        (SHARP, "/dev/full", 2, ["torchbokeh: standard output: cannot be written (No space left on device)"]),
+        (SHARP, "a pipe that nobody reads", 141, []),
+        (SHARP, "closed", 0, []),
+    ],
+)
+def test_standard_output(folder: Path, command: tuple[str, ...], target: str, status: int, line: list[str]) -> None:
+    """The interpreter has nothing to add at its end."""
+    if target == "closed":
+        process = start(folder, *command, stdout=None, preexec_fn=partial(os.close, 1))
+    else:
+        read, write = (0, os.open(target, os.O_WRONLY)) if target == "/dev/full" else os.pipe()
+        if read:
+            os.close(read)
+        process = start(folder, *command, stdout=write)
         os.close(write)
-    lines = ended(process)
-    assert process.returncode == 2
-    assert len(lines) == 1
-    assert re.match("torchbokeh: standard output: cannot be written ", lines[0])
+    assert (ended(process), process.returncode) == (line, status)
+    if command == SHARP:
+        read_image(folder / "out.tif")
 
 
 def test_ctrl_c_leaves_no_thread_at_work() -> None:

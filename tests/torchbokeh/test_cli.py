@@ -1,5 +1,7 @@
 """The command line: what it renders, and one line and a status for everything that is wrong."""
 
+import io
+import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -301,3 +303,65 @@ def test_module_runs_without_a_traceback(tmp_path):
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("torchbokeh: ")
+
+
+@pytest.fixture
+def printed_to(monkeypatch):
+    """Have standard output be a file, buffered or not; it is closed afterwards."""
+    opened = []
+
+    def open_as(file, unbuffered):
+        raw = io.FileIO(file, "w")
+        opened.append(io.TextIOWrapper(raw if unbuffered else io.BufferedWriter(raw), write_through=unbuffered))
+        monkeypatch.setattr(sys, "stdout", opened[-1])
+
+    yield open_as
+    for stream in opened:
+        stream.close()
+
+
+PRINTING = [["--help"], ["--version"], ["psfs", "--help"], ["psfs", "table", "simple-lens", "--held-out", "1"]]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a device that is full")
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("argv", PRINTING, ids=" ".join)
+def test_a_full_disk_under_standard_output(capsys, printed_to, argv, unbuffered):
+    printed_to("/dev/full", unbuffered)
+    assert main(argv) == 2
+    assert capsys.readouterr().err == "torchbokeh: standard output: cannot be written (No space left on device)\n"
+
+
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize("argv", PRINTING, ids=" ".join)
+def test_a_pipe_that_nobody_reads(capsys, printed_to, argv, unbuffered):
+    """Not worth a word: after ``| head`` nobody wants more."""
+    read, write = os.pipe()
+    os.close(read)
+    printed_to(write, unbuffered)
+    assert main(argv) == 141
+    assert capsys.readouterr().err == ""
+
+
+def test_an_error_after_what_nobody_reads(scene, capsys, printed_to, monkeypatch):
+    """Ctrl-C ends the reader too: nothing is left in the buffer that the interpreter could fail to write."""
+
+    def fail(*args):
+        raise KeyboardInterrupt
+
+    read, write = os.pipe()
+    os.close(read)
+    printed_to(write, False)
+    monkeypatch.setattr("torchbokeh.cli_render.write_image", fail)
+    assert render(*THIN) == 130
+    assert capsys.readouterr().err == "torchbokeh: interrupted\n"
+    sys.stdout.flush()
+
+
+def test_closed_standard_streams(scene, capsys, monkeypatch):
+    for name, argv, status in (("stdout", THIN, 0), ("stderr", (), 2)):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, name, None)
+            assert render(*argv) == status
+            getattr(sys, name).close()
+    assert capsys.readouterr().out == ""  # not what was meant for the closed stream either

@@ -3,7 +3,9 @@
 import builtins
 import os
 import struct
+import warnings
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import tifffile
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, JpegImagePlugin, PngImagePlugin
 
 from torchbokeh.image_io import (
     check_writable,
@@ -146,6 +148,24 @@ def test_jpeg_is_decoded_and_turned_upright(tmp_path):
     exif[0x0112] = 6  # stored turned left, to be shown turned right by 90 degrees
     Image.fromarray(np.rot90(upright)).save(tmp_path / "a.jpg", exif=exif, quality=100, subsampling=0)
     np.testing.assert_allclose(to_hwc(read_image(tmp_path / "a.jpg")), upright / 255, atol=0.01)
+
+
+def test_threads_that_read_leave_the_filters_of_warnings_alone(tmp_path, monkeypatch):
+    """And pictures that Pillow finds large are read without a word."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 20)
+    before, seen = warnings.filters, set()
+    for kind, plugin in ((".png", PngImagePlugin.PngImageFile), (".jpg", JpegImagePlugin.JpegImageFile)):
+        Image.fromarray(samples(np.uint8)).save(tmp_path / f"a{kind}")
+
+        def watch(image, decode=plugin._open):
+            seen.add(warnings.filters is before)
+            decode(image)
+
+        monkeypatch.setattr(plugin, "_open", watch)
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(read_image, 16 * [tmp_path / "a.png", tmp_path / "a.jpg"]))
+    assert seen == {True}
+    assert warnings.filters is before
 
 
 def test_one_bit_and_palette_png(tmp_path):

@@ -1,10 +1,13 @@
-"""Write a report: ``report.md``, ``report.json`` and plots, each whole or not at all."""
+"""Write a report: ``report.md``, ``report.json`` and plots, all of them or none."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-from torchbokeh.image_io import check_writable, replacing
+from matplotlib.figure import Figure
+
+from torchbokeh.image_io import check_writable
+from torchbokeh.ops._files import replacing_together
 from torchbokeh.report.plots import draw
 from torchbokeh.report.tables import markdown
 
@@ -38,11 +41,26 @@ def write_report(found: dict[str, Any], folder: Path) -> list[Path]:
         The files written, ``report.md`` first.
     """
     figures = draw(found)
-    for name, figure in figures.items():
-        with replacing(folder / name) as temporary:
-            figure.savefig(temporary, dpi=DPI)
-    with replacing(folder / "report.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with replacing(folder / "report.md") as temporary:
-        temporary.write_text(markdown(found, list(figures)), encoding="utf-8")
-    return [folder / "report.md", folder / "report.json", *(folder / name for name in figures)]
+    return write_together(folder, "report", markdown(found, list(figures)), found, figures)
+
+
+def write_together(folder: Path, name: str, text: str, found: Any, figures: dict[str, Figure]) -> list[Path]:
+    """Write a text, the numbers it speaks of and its plots, all of them or none.
+
+    Args:
+        folder: an existing folder; files of the same names are replaced.
+        name: of the text and the numbers, without extension.
+        text: Markdown.
+        found: what JSON can hold.
+        figures: plots by the names of their files.
+
+    Returns:
+        The files written, the text first.
+    """
+    with replacing_together(folder, f"{name}.md") as temporary:
+        for plot, figure in figures.items():
+            figure.savefig(temporary / plot, dpi=DPI)
+        numbers = json.dumps(found, indent=1, allow_nan=False) + "\n"
+        (temporary / f"{name}.json").write_text(numbers, encoding="utf-8")
+        (temporary / f"{name}.md").write_text(text, encoding="utf-8")
+    return [folder / file for file in (f"{name}.md", f"{name}.json", *figures)]
