@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 
+from torchbokeh.ops._checks import MOST_PIXELS
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.integrate import poisson_fft, running_sum_x
 from torchbokeh.ops.points import splat_points
@@ -149,6 +150,11 @@ def _together(drawn: Sequence[_Drawn], bank: PsfBank, dense: bool) -> Tensor:
         if not here:
             continue
         pad = max(math.ceil(float(reach[u].max()) * _stretch(d.place) + _shift(d.place)) + ROOM for d, u in here)
+        if (height + 2 * pad) * (width + 2 * pad) > MOST_PIXELS:
+            raise ValueError(
+                f"coc: expected PSFs of a bank that need at most {MOST_PIXELS} pixels with what they reach, "
+                f"got PSFs that reach {pad} px beyond {width} x {height} pixels; clamp the CoC or the motion"
+            )
         buffer = reduce(torch.add, (_splat_channels(d, bank, domain, pad) for d, _ in here))
         out = out + _INTEGRALS[domain](buffer)[..., pad : pad + height, pad : pad + width]
     return out

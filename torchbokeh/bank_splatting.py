@@ -144,28 +144,31 @@ def splat_bank(
         ValueError: the model needs another label.
     """
     parts = [located(p, bank, values) for p in ([labels] if isinstance(labels, Labels) else labels)]
-    values, parts = _confined(values, parts, bank)
-    dense, values = _highlights(values if len(parts) == 1 else values / len(parts), parts, bank, interpolate)
+    extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
+    values = values if len(parts) == 1 else values / len(parts)
+    dense, values = _highlights(values, parts, bank, interpolate, extreme)
 
     def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
         out = torch.zeros_like(cells)
-        alive = spreading(cells)[:, None]
         moving: list[tuple[Tensor, Labels]] = []
         discs: list[tuple[Tensor, Tensor]] = []
         for part in now:
+            lit, part = _confined(cells, part, size) if extreme else (cells, part)
             still = None if part.coc is None else bank.model.still(part)
             if still is None or part.coc is None:
-                moving.append((cells, part))
+                moving.append((lit, part))
                 continue
+            alive = spreading(lit)[:, None]
             if bool((alive & (still < 1)).any()):
-                moving.append((cells * (1 - still), part))
+                moving.append((lit * (1 - still), part))
+            if not bool((alive & (still > 0)).any()):
+                continue
             if discs and discs[-1][0] is part.coc:
-                discs[-1] = part.coc, discs[-1][1] + still
+                discs[-1] = part.coc, discs[-1][1] + lit * still
             else:
-                discs.append((part.coc, still))
-        for coc, still in discs:
-            if bool((alive & (still > 0)).any()):
-                out = out + splat_spans(cells * still, coc / size, Disc().profile(), integrate=True)
+                discs.append((part.coc, lit * still))
+        for coc, lit in discs:
+            out = out + splat_spans(lit, coc / size, Disc().profile(), integrate=True)
         return out + splat_samples(moving, bank, size, interpolate) if moving else out
 
     if merging is None or highest == 0:
@@ -194,34 +197,63 @@ def splat_bank(
     return dense + merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
 
 
-def _confined(values: Tensor, parts: list[Labels], bank: PsfBank) -> tuple[Tensor, list[Labels]]:
-    """The same picture without discs that are far larger than it, whose buffers would be as large as they.
+def _far_beyond(values: Tensor, parts: Sequence[Labels]) -> bool:
+    """Whether a way or a disc is far larger than the picture, so that its buffer would be as large as it."""
+    sizes = [t.detach().square().sum(1) for p in parts for t in (p.motion, p.offset) if t is not None]
+    sizes += [p.coc.detach()[:, 0].square() for p in parts if p.coc is not None]
+    if not values.numel() or not sizes:
+        return False
+    return bool(torch.stack([t.max() for t in sizes]).amax().sqrt() > math.hypot(*values.shape[2:]))
 
-    A disc that covers the whole picture from each end of its way has the same density all over it, the reciprocal of
-    its area. So a smaller one that does that too stands for it, with as much less light.
+
+def _confined(values: Tensor, part: Labels, size: int) -> tuple[Tensor, Labels]:
+    """The same picture with ways and discs that are no larger than it asks for, for `Combined`.
+
+    A disc that moves evenly is a mean of discs over time. Those that do not reach the picture add nothing: what is left
+    is a shorter way, with as much less light. A disc that covers all of the picture all the time has the same density
+    everywhere, the reciprocal of its area: a smaller one that stands still stands for it, with as much less light.
+
+    Args:
+        values: ``(B, C, h, w)``, of blocks of ``size`` px.
+        part: its labels, in px.
+        size: see ``values``.
     """
-    coc = parts[0].coc
-    if not isinstance(bank.model, Combined) or coc is None or any(p.coc is not coc for p in parts):
-        return values, parts
-    ways = [t for p in parts for t in (p.motion, p.offset) if t is not None]
-    lengths = [way.detach().square().sum(1, keepdim=True).sqrt() for way in ways]
-    enough = torch.stack([torch.zeros_like(coc), *lengths]).amax(0) * 1.5 + math.hypot(*coc.shape[2:]) + 1
-    if not bool((coc.detach().abs() > enough).any()):
-        return values, parts
-    ratio = (enough / coc.abs().clamp_min(TINY)).clamp(max=1.0)
-    smaller = coc * ratio
-    return values * ratio.square(), [p._replace(coc=smaller) for p in parts]
+    coc, height, width = needed(part), values.shape[2] * size, values.shape[3] * size
+    motion = torch.zeros_like(coc).expand(-1, 2, -1, -1) if part.motion is None else part.motion
+    offset = torch.zeros_like(motion) if part.offset is None else part.offset
+    rows, columns = ((torch.arange(n, device=coc.device) + 0.5) * size - 0.5 for n in values.shape[2:])
+    radius, length = coc.abs(), motion.detach().square().sum(1, keepdim=True).sqrt()
+    diagonal = math.hypot(height, width) + size
+    wide = radius > diagonal + length / 2 + offset.detach().square().sum(1, keepdim=True).sqrt()
+    # Samples of the bank fade towards their ends, so these are to lie well beyond the picture.
+    room = radius + max(height, width) / 4 + 2 * size
+    first, last = torch.full_like(radius, -0.5), torch.full_like(radius, 0.5)
+    for axis, (place, extent) in enumerate(((columns, width), (rows[:, None], height))):
+        start, speed = place + offset[:, axis : axis + 1], motion[:, axis : axis + 1]
+        speed = torch.where(speed.abs() < TINY, TINY, speed)
+        ends = (-0.5 - room - start) / speed, (extent - 0.5 + room - start) / speed
+        first, last = first.maximum(torch.minimum(*ends)), last.minimum(torch.maximum(*ends))
+    share, middle = (last - first).clamp_min(0), (first + last) / 2
+    uncut = (length <= diagonal + 2 * room) & (share > 0)
+    share, middle = torch.where(uncut, 1.0, share), torch.where(uncut, 0.0, middle)
+    there = (share > 0) & ~wide
+    light = torch.where(wide, (diagonal / radius.clamp_min(1.0)).square(), share)
+    motion, offset = (torch.where(there, t, 0.0) for t in (share * motion, offset + middle * motion))
+    coc = torch.where(there, coc, torch.where(wide, diagonal, 0.0))
+    return values * light, part._replace(coc=coc, motion=motion, offset=offset)
 
 
 def _highlights(
-    values: Tensor, parts: Sequence[Labels], bank: PsfBank, interpolate: bool
+    values: Tensor, parts: Sequence[Labels], bank: PsfBank, interpolate: bool, extreme: bool
 ) -> tuple[Tensor | float, Tensor]:
     """What pixels spread that are so bright that the ripples of a sparse PSF would be seen, and all other values."""
     if not values.numel():
         return 0.0, values
+    seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
     with torch.no_grad():
-        bound = _usual(values) * (BRIGHT * _area(parts, bank)).clamp_min(LEAST_CONTRAST)
-        excess = (values.abs() / bound.clamp_min(TINY)).amax(1).flatten()
+        light = torch.stack([lit for lit, _ in seen]).mean(0) if extreme else values
+        bound = _usual(light) * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+        excess = (light.abs() / bound.clamp_min(TINY)).amax(1).flatten()
         pixels = (excess > 1).nonzero()[:, 0]
         if len(pixels) > MOST:
             pixels = excess.topk(MOST).indices.sort().values
@@ -238,10 +270,10 @@ def _highlights(
         return t.movedim(1, -1).flatten(0, 2)[pixels]
 
     dense = torch.zeros_like(values)
-    for part in parts:
+    for lit, part in seen:
         way = of(torch.zeros_like(values[:, :2]) if part.motion is None else part.motion)
         centre = torch.zeros_like(way) if part.offset is None else of(part.offset)
-        dense = dense + splat_capsules(values, pixels, of(needed(part))[:, 0].abs(), way, centre)
+        dense = dense + splat_capsules(lit, pixels, of(needed(part))[:, 0].abs(), way, centre)
     return dense, rest
 
 

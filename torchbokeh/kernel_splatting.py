@@ -67,6 +67,9 @@ class KernelSplatting(nn.Module):
     A pixel that is NaN or infinite spoils its own channel of its own picture alone: the rows of its PSF, from there to
     the right border; with a bank, or where one convolution does it, all of it.
 
+    Half precision is computed in float32, and the result rounded. What it cannot hold becomes infinite there, as with
+    all of torch: above 65504 in float16. Only a bank whose PSFs are coloured can make a picture brighter than it was.
+
     Memory on the CPU in float32 for three channels, result included and inputs not: at most 45 MB per megapixel forward
     and 125 MB backward where pixels are merged, 70 and 180 MB for exact quality, whatever the radius.
 
@@ -75,7 +78,8 @@ class KernelSplatting(nn.Module):
         quality: ``"exact"``, ``"high"``, ``"balanced"`` or ``"fast"``; see `torchbokeh.quality.QUALITIES`.
         tolerance: relative L1 error to keep to, as far as it can be predicted; picks the quality instead.
         bank: sparse PSFs of any model in the place of the aperture, see `torchbokeh.psfs.PsfBank`: every pixel takes
-            the sample that is nearest to its CoC, depth or motion.
+            the sample that is nearest to its CoC, depth or motion. What is larger than all samples is scaled from the
+            largest; a picture is refused where that takes more than 134 megapixels with what its PSFs reach.
         interpolate: of a bank, take the neighbouring samples by their shares instead of the nearest one: nearer to the
             model, and differentiable in all of its coordinates, for two (or four) times the time.
 

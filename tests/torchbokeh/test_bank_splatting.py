@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchbokeh import KernelSplatting, Polygon
 from torchbokeh.bank_splatting import packed, splat_bank, unpacked
+from torchbokeh.ops.capsules import _density
 from torchbokeh.ops.merge import Merging
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs import Combined, Disc, Labels, PsfBank, SimpleLens
@@ -316,6 +317,17 @@ def test_highlights_of_coloured_psfs_do_not_leak() -> None:
     torch.testing.assert_close(added.sum((1, 2)), torch.full((3,), 1e6), rtol=0.01, atol=0)
 
 
+def test_half_precision_overflows_as_in_torch() -> None:
+    # A yellow and magenta star: more red light than there was, and less green.
+    blur = KernelSplatting(bank=PsfBank.load("stylized"), quality="exact")
+    image, coc = torch.full((1, 3, 9, 8), 65504.0), torch.full((1, 1, 9, 8), 4.0)
+    out = blur(image.half(), coc.half())
+    assert (out[:, 0] == torch.inf).all()
+    assert out[:, 1:].isfinite().all()
+    torch.testing.assert_close(out, blur(image.double(), coc.double()).half())
+    assert blur(image.bfloat16(), coc.bfloat16()).isfinite().all()
+
+
 def test_a_cluster_of_highlights_does_not_hide_itself(bank: PsfBank) -> None:
     image, labels = torch.ones(1, 2, 96, 96), scene(96, 96, 19.0, 8.0, 8.0)
     lit = image.clone()
@@ -342,3 +354,80 @@ def test_a_disc_far_wider_than_the_picture_covers_it_evenly(bank: PsfBank) -> No
     torch.testing.assert_close(out, image.mean((2, 3), keepdim=True).expand_as(out), atol=2e-3, rtol=0)
     near = KernelSplatting(quality="exact")(image, labels.coc)
     torch.testing.assert_close(out, near, atol=2e-3, rtol=0)
+
+
+def by_density(values: Tensor, labels: Labels) -> Tensor:
+    """Every capsule in closed form at the pixels of the picture, without its sum: it may be as long as it likes."""
+    h, w = values.shape[2:]
+    y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    place = torch.stack([x.flatten(), y.flatten()], 1).to(values)
+    radius, motion = labels.coc.flatten(), labels.motion[0].flatten(1).T
+    centre = place if labels.offset is None else place + labels.offset[0].flatten(1).T
+    out = torch.zeros_like(values).flatten(2)
+    for shift in ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25)):
+        light = _density(place + torch.tensor(shift).to(values), radius, motion, centre)
+        out += values.flatten(2) @ (light / (8 * math.pi * radius[:, None] ** 2))
+    return out.view_as(values)
+
+
+@pytest.mark.parametrize("from_start", [False, True])
+@pytest.mark.parametrize("highlight", [1.0, 1e5])
+def test_only_the_part_of_a_way_that_crosses_the_picture_is_drawn(
+    bank: PsfBank, from_start: bool, highlight: float
+) -> None:
+    draw = torch.Generator().manual_seed(3)
+    ways = torch.randn(1, 2, 20, 26, dtype=F64, generator=draw)
+    ways = ways / ways.norm(dim=1, keepdim=True)
+    values = torch.rand(1, 3, 20, 26, dtype=F64, generator=draw)
+    values[:, -1], values[0, 0, 7, 9] = 1.0, highlight
+    found = []
+    for length in (30.0, 300.0, 2000.0, 1e5):
+        motion = length * ways
+        labels = Labels(torch.full((1, 1, 20, 26), 4.0, dtype=F64), None, motion, motion / 2 if from_start else None)
+        got, want = splat_bank(values, labels, bank), by_density(values, labels)
+        assert float((got - want).abs().sum() / want.abs().sum()) < 0.025
+        found.append(got[:, :-1] / got[:, -1:])
+    torch.testing.assert_close(found[2], found[3], rtol=1e-6, atol=0)  # both ends of all ways are beyond the picture
+
+
+def test_a_long_way_has_the_gradient_of_the_part_that_is_drawn(bank: PsfBank) -> None:
+    values, labels = mixed(14, 17, 4.0, 1.0, seed=5)
+    draw = torch.Generator().manual_seed(1)
+    aim = torch.rand(values.shape, dtype=F64, generator=draw)
+    step = torch.randn(labels.motion.shape, dtype=F64, generator=draw)  # type: ignore[union-attr]
+    angle = (labels.motion * 40).requires_grad_()  # the longest of them are cut
+
+    def loss(motion: Tensor) -> Tensor:
+        return (aim * splat_bank(values, labels._replace(motion=motion), bank, interpolate=True)).sum()
+
+    (grad,) = torch.autograd.grad(loss(angle), angle)
+    lengths = angle.detach().norm(dim=1)
+    assert float(lengths.min()) < 30 < 38 < float(lengths.max())
+    with torch.no_grad():
+        change = [loss(angle + e * step).item() for e in (1e-6, -1e-6)]  # there are kinks a little farther away
+    assert (change[0] - change[1]) / 2e-6 == pytest.approx((grad * step).sum().item(), rel=2e-3)
+
+
+def test_wide_discs_on_long_ways_cover_the_picture_evenly(bank: PsfBank) -> None:
+    values = torch.rand(1, 4, 14, 11, generator=torch.Generator().manual_seed(1))
+    ways = [scene(14, 11, r, 1600.0, -1200.0)._replace(offset=None) for r in (1e4, 3000.0)]
+    for merging in (None, Merging(4.0, 0.015)):
+        out = splat_bank(values, ways, bank, merging, highest=0 if merging is None else 1)
+        light = sum(0.5 / (math.pi * r**2) for r in (1e4, 3000.0)) * values.sum((2, 3), keepdim=True)
+        torch.testing.assert_close(out, light.expand_as(out), rtol=1e-2, atol=0)
+
+
+@pytest.mark.parametrize(("name", "radius", "error"), [("simple-lens", 250.0, 1e-3), ("physical-lens", 120.0, 0.1)])
+def test_psfs_beyond_what_a_bank_samples_are_scaled(name: str, radius: float, error: float) -> None:
+    wide, labels = PsfBank.load(name), Labels(coc=torch.full((1, 1, 16, 13), radius))
+    assert radius > 2 * wide.model.axes[0].bound
+    values = torch.ones(1, 2 * wide.values.shape[1], 16, 13)
+    near = splat_bank(values, labels._replace(coc=labels.coc / 2), wide)[..., 6:10, 5:9]
+    # Around the middle of the picture, what arrives is the density in the middle of PSFs of twice the size.
+    torch.testing.assert_close(4 * splat_bank(values, labels, wide)[..., 6:10, 5:9], near, rtol=error, atol=0)
+
+
+def test_psfs_that_need_too_large_a_buffer_are_refused() -> None:
+    blur = KernelSplatting(bank=PsfBank.load("physical-lens"), quality="exact")
+    with pytest.raises(ValueError, match=r"coc: expected PSFs .* got PSFs that reach 2\d{4} px beyond 12 x 9 pixels"):
+        blur(torch.rand(1, 3, 9, 12), torch.full((1, 1, 9, 12), 1e4))
