@@ -9,11 +9,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh._motion import Motion, ways
+from torchbokeh.dispersion import SEEN
 from torchbokeh.field_map import Field
 from torchbokeh.layers import continued
 from torchbokeh.lens import Lens
+from torchbokeh.ops._dispatch import compute_dtype
 from torchbokeh.plan import Colour, Plan
-from torchbokeh.planning import Look, Moves, Wishes, decide
+from torchbokeh.planning import Look, Moves, Wishes, decide, passed
 
 STEPS = 4
 """Steps to the place that comes to lie on a pixel; each leaves an error smaller by the slope of the magnification."""
@@ -45,6 +47,7 @@ def plan_colours(
     dispersion = lens.dispersion
     if dispersion is None:
         return plan
+    like = like[..., :1].to(compute_dtype(like))
     field, width = Field.pixels(look.size, margin, like), look.size[1] - 2 * margin
     first, last = dispersion.wavelengths()
     shifts = lens.coc_shift(first, width, field) - lens.coc_shift(last, width, field)
@@ -52,7 +55,8 @@ def plan_colours(
     away = (scale * torch.hypot(field.x, field.y)).abs().max()
     spread, sideways = torch.stack([shifts.abs().max().to(away), away]).tolist()
     learned = dispersion.axial.requires_grad or dispersion.lateral.requires_grad
-    light = dispersion.light(max(spread + sideways, 1.0 if learned else 0.0))
+    seen = max(spread + sideways, 1.0 if learned else 0.0)
+    light = dispersion.light(seen)
     if not light:
         return plan
     enlarged = sideways > 0 or dispersion.lateral.requires_grad
@@ -65,8 +69,10 @@ def plan_colours(
     colours = []
     for one, (low, high) in zip(light, torch.stack(found).tolist(), strict=True):
         own = look._replace(low=cut(look.low, low), high=cut(look.high, high))
-        colours.append(Colour(one, enlarged, decide(own, moves, wishes, background=plan.hidden == "given")))
-    return replace(plan, colours=tuple(colours), spread=spread + sideways)
+        colours.append(Colour(one, enlarged, decide(own, moves, wishes)))
+    plain = 1 - passed(seen, (SEEN, 2 * SEEN))
+    fading = ((plan, plain),) if plain > 0 else ()
+    return replace(plan, colours=tuple(colours), spread=spread + sideways, fading=fading)
 
 
 def blur_colours(
@@ -82,6 +88,7 @@ def blur_colours(
         margin: px on each side that lie beyond the sensor.
         limit: largest radius in px.
     """
+    given = _working(given)
     layered = given.image.dim() == 5
     field = Field.pixels(plan.size, margin, given.signed)
     out = [torch.zeros_like(given.signed if not layered else given.signed[:, 0])] * (4 if layered else 3)
@@ -93,6 +100,20 @@ def blur_colours(
         if layered:
             out[3] = out[3] + sum(light.rgb) / 3 * part[:, -1:]
     return torch.cat(out, 1)
+
+
+def _working(given: Given) -> Given:
+    """The same in at least float32: half precision can tell neither radii nor the columns of a wide picture apart."""
+    image, signed, motion, ends, behind = given
+    dtype = compute_dtype(image, signed)
+
+    def of(t: Tensor | None) -> Tensor | None:
+        return None if t is None else t.to(dtype)
+
+    if behind is not None:
+        behind = behind[0].to(dtype), of(behind[1])
+    moved = None if motion is None else [way.to(dtype) for way in ways(motion)]
+    return Given(image.to(dtype), signed.to(dtype), moved, of(ends), behind)
 
 
 def _of_light(

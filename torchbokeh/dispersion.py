@@ -11,6 +11,8 @@ from torchbokeh.glass import relative_focal_length
 from torchbokeh.held import Held, check_parameter
 from torchbokeh.ops.spectrum import HIGH, LOW, Weight, spectral_bands
 
+Spectrum = Literal["rgb", "continuous"]
+
 RGB = (650.0, 510.0, 475.0)
 """Wavelengths in nanometres that stand for red, green and blue (section 4.2.1 of the dissertation)."""
 
@@ -24,7 +26,7 @@ SEEN = 0.05
 """A spread of colours of fewer px is left out."""
 
 FAINT = 2e-3
-"""A band leaves out a channel that gets less than this share of its light from it."""
+"""A band leaves out a channel that gets less than this share of its light from it, and part of it up to twice that."""
 
 
 class Light(NamedTuple):
@@ -80,7 +82,7 @@ class Dispersion(Held):
         *,
         axial_map: FieldMap | None = FieldMap(),  # noqa: B008 - immutable
         lateral_map: FieldMap | None = FieldMap(),  # noqa: B008
-        spectrum: Literal["rgb", "continuous"] = "rgb",
+        spectrum: Spectrum = "rgb",
         reference: float = RGB[0],
         equaliser: Weight = None,
     ) -> None:
@@ -145,22 +147,24 @@ class Dispersion(Held):
     def light(self, spread: float) -> tuple[Light, ...]:
         """What a picture whose colours spread over that many px is put together from; nothing where that is not seen.
 
-        A continuous spectrum is cut into bands that are `STEP` px apart, evenly in what the glass does.
+        A continuous spectrum is cut into bands that are `STEP` px wide, evenly in what the glass does, from its short
+        end. The last one is as wide as what is left: new bands begin as narrow ones, and no picture jumps.
         """
         if spread < SEEN:
             return ()
         if self.spectrum == "rgb":
             return tuple(Light(w, tuple(float(k == c) for c in range(3))) for k, w in enumerate(RGB))  # type: ignore[arg-type]
-        count = min(max(math.ceil(spread / STEP), FEWEST), MOST)
+        count = min(max(spread / STEP, FEWEST), MOST)
         grid = torch.linspace(LOW, HIGH, 801, dtype=torch.float64)
         power = 1 / relative_focal_length(self.glass, grid, self.reference)
         place = (power[0] - power) / (power[0] - power[-1])
         if not bool(self.axial.detach().any()):  # the lateral part is even in the wavelength itself
             place = (grid - LOW) / (HIGH - LOW)
-        cuts = torch.searchsorted(place.contiguous(), torch.linspace(0, 1, count + 1, dtype=torch.float64)[1:-1])
-        edges = torch.cat([grid[:1], grid[cuts.clamp(1, 799)].unique(), grid[-1:]])
-        centres, rgb = spectral_bands(edges, self.equaliser)
-        rgb = torch.where(rgb < FAINT, 0.0, rgb)
+        cuts = torch.arange(1, math.ceil(count - 1e-9), dtype=torch.float64) / count
+        k = torch.searchsorted(place.contiguous(), cuts)
+        inner = torch.lerp(grid[k - 1], grid[k], (cuts - place[k - 1]) / (place[k] - place[k - 1]))
+        centres, rgb = spectral_bands(torch.cat([grid[:1], inner, grid[-1:]]), self.equaliser)
+        rgb = rgb * (rgb / FAINT - 1).clamp(0, 1)
         rgb = rgb / rgb.sum(0).clamp_min(1e-12)
         bands = zip(centres.tolist(), rgb.tolist(), strict=True)
         return tuple(Light(w, tuple(share)) for w, share in bands if any(share))

@@ -106,7 +106,8 @@ class _Blur(nn.Module):
         super().__init__()
         self.blur, self.plan = blur, plan
         # Shapes of apertures are made by sorting and searching; they are constants here.
-        self.pieces = subdivide(blur.aperture.profile(), plan.subapertures)
+        profile = blur.aperture.profile()
+        self.pieces = {count: subdivide(profile, count) for count in plan.cuts}
 
     def forward(self, image: Tensor, depth: Tensor) -> Tensor:
         depth_map, coc = (None, depth) if self.blur.lens is None else (depth, None)

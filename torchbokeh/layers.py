@@ -27,7 +27,7 @@ FOREGROUND = (-2.0, -1.0)
 """Signed CoC (px) between which a pixel passes from foreground to rest. What is sharper hides nothing."""
 
 SPACING = 6.0
-"""Distance of the bins in px of CoC. Closer ones change the picture little: what counts is what hides what."""
+"""Distance of bins in px of CoC, where there are three or more. What counts is what hides what."""
 
 COARSE = 4
 """Where pixels are merged, what is hidden is filled in blocks of this many pixels each way."""
@@ -128,11 +128,19 @@ class Surface:
 
 
 def bin_centres(low: float, high: float, most: int) -> tuple[float, ...]:
-    """Evenly spaced bins for CoCs from ``low`` to ``high`` px, about `SPACING` apart and at most ``most``."""
-    count = 1 if high - low <= 1 else min(most, 1 + math.ceil((high - low) / SPACING))
-    if count == 1:
+    """Evenly spaced bins for CoCs from ``low`` to ``high`` px, `SPACING` apart if ``most`` allows.
+
+    They move and appear without a jump as the CoCs change: a new bin begins with a share of 0. The last one may lie
+    beyond ``high``. Between 1 and 2 px, one bin becomes two.
+    """
+    extent = high - low
+    if extent <= 1 or most == 1:
         return (0.5 * (low + high),)
-    return tuple(low + (high - low) * k / (count - 1) for k in range(count))
+    if extent <= 2:
+        shift = (2 - extent) * extent
+        return low + shift, high + shift
+    spacing = max(min(extent, SPACING), extent / (most - 1))
+    return tuple(low + spacing * k for k in range(1 + math.ceil(extent / spacing - 1e-9)))
 
 
 def split_foreground(
@@ -233,9 +241,9 @@ def continued(coc: Tensor, alpha: Tensor) -> Tensor:
 
 
 def blurred(
-    surface: Surface, profile: Profile, merging: Merging | None = None, highest: int = 0
+    surface: Surface, profile: Profile, merging: Merging | None = None, highest: int = 0, *, coarse: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One surface through one sub-aperture, exact or merged by radius.
+    """One surface through one sub-aperture, exact or merged by radius, for `compose`.
 
     Returns:
         The mean colour ``(B, C, H, W)``, the share ``(B, 1, H, W)`` of the light that the surface stops, and the
@@ -248,8 +256,11 @@ def blurred(
         colour, coverage = blur_surface(plain, alpha, surface.coc, surface.centres, profile, merging, highest)
         if alpha is None:
             return colour, torch.ones_like(coverage), coverage
-        half = half_density(*block_sums(surface.coc, alpha), profile, merging, highest)
-        whole = _enlarged_density(half, surface.coc)
+        if coarse:
+            half = half_density(*block_sums(surface.coc, alpha), profile, merging, highest)
+            whole = _enlarged_density(half, surface.coc)
+        else:
+            whole = splat_merged(torch.ones_like(alpha), surface.coc, profile, merging, highest=highest).clamp_min(0)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
     moving = surface.moving
@@ -265,7 +276,7 @@ def blurred(
     if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.
-    if moving is None or merging is None:
+    if moving is None or merging is None or not coarse:
         whole = spread(torch.ones_like(alpha)).clamp_min(0)
     else:
         whole = _enlarged_density(_moving_density(surface.coc, moving, merging, highest), surface.coc)
@@ -366,7 +377,12 @@ def _(image: Tensor, *settings: object) -> Tensor:
 
 
 def compose(
-    surfaces: Sequence[Surface], pieces: Sequence[Profile], merging: Merging | None = None, highest: int = 0
+    surfaces: Sequence[Surface],
+    pieces: Sequence[Profile],
+    merging: Merging | None = None,
+    highest: int = 0,
+    *,
+    coarse: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Blur all surfaces and put them over one another, front to back, for every sub-aperture.
 
@@ -380,6 +396,8 @@ def compose(
         pieces: the sub-apertures, see `torchbokeh.ops.spans.subdivide`.
         merging: how far to merge by radius; ``None``: not at all.
         highest: the coarsest level to merge on.
+        coarse: where pixels are merged, find in blocks how dense the splats of a surface are; its CoC need then not be
+            continued to where it is not.
 
     Returns:
         Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``, 1 where something opaque is behind.
@@ -392,7 +410,7 @@ def compose(
         votes = crowd = zero
         left = zero + area(profile).to(zero.dtype)
         for surface in surfaces:
-            mean, stopped, density = blurred(surface, profile, merging, highest)
+            mean, stopped, density = blurred(surface, profile, merging, highest, coarse=coarse)
             known = (CERTAIN * density).clamp(max=1)
             vote = left * stopped * known
             seen = seen + vote * mean

@@ -1,6 +1,6 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from numbers import Real
 
@@ -31,6 +31,8 @@ from torchbokeh.psfs.combined import STILL, turned_capsule
 from torchbokeh.quality import check_quality
 
 Background = Tensor | tuple[Tensor, Tensor] | None
+
+Pieces = Mapping[int, Sequence[Profile]]
 
 MOST = 64
 """Sub-apertures along each direction of the lens, at most."""
@@ -150,10 +152,11 @@ class LensBlur(nn.Module):
         return self._plan(given, cut)
 
     def _plan(self, given: Given, cut: Tensor | None) -> Plan:
-        wishes = Wishes(self.quality, self.tolerance, self.layers, self.subapertures, repr(self.aperture))
+        known = given.behind is not None
+        wishes = Wishes(self.quality, self.tolerance, self.layers, self.subapertures, repr(self.aperture), known)
         look = look_at(given.image, given.signed, cut, wishes)
         moves = look_at_motion(given.image, given.motion, given.ends)
-        plan = decide(look, moves, wishes, background=given.behind is not None)
+        plan = decide(look, moves, wishes)
         if self.lens is None:
             return plan
         margin, limit = self.margin, self.max_coc
@@ -204,19 +207,33 @@ class LensBlur(nn.Module):
             plan = self._plan(given, cut)
         self._check_plan(plan, given)
         profile = self.aperture.profile()
+        out = self._blur(given, plan, {count: subdivide(profile, count) for count in plan.cuts})
+        return self._cropped(_tied(out, given, plan, profile)).to(image.dtype)
 
-        if self.lens is None or not plan.colours:
-            out = self._blur(given, plan, subdivide(profile, plan.subapertures))
-            return self._cropped(_tied(out, given, plan, profile)).to(image.dtype)
+    def _blur(self, given: Given, plan: Plan, pieces: Pieces) -> Tensor:
+        """The picture ``(B, C, H, W)``, as mixed from plans.
 
-        def blur(one: Given, own: Plan) -> Tensor:
-            return _tied(self._blur(one, own, subdivide(profile, own.subapertures)), one, own, profile)
+        Args:
+            given: the picture and its maps.
+            plan: what to do.
+            pieces: the sub-apertures, by how many there are each way.
+        """
+        if plan.colours:
+            assert self.lens is not None
+            blur = partial(self._of_one_light, pieces=pieces)
+            own = blur_colours(given, plan, self.lens, blur, margin=self.margin, limit=self.max_coc)
+        else:
+            own = self._painted(given, plan, pieces[plan.subapertures])
+        out = own
+        for other, share in plan.fading:
+            out = out + share * (self._blur(given, other, pieces) - own)
+        return out
 
-        out = blur_colours(given, plan, self.lens, blur, margin=self.margin, limit=self.max_coc)
-        return self._cropped(out).to(image.dtype)
+    def _of_one_light(self, given: Given, plan: Plan, pieces: Pieces) -> Tensor:
+        return _tied(self._blur(given, plan, pieces), given, plan, self.aperture.profile())
 
-    def _blur(self, given: Given, plan: Plan, pieces: Sequence[Profile]) -> Tensor:
-        """The picture ``(B, C, H, W)`` of one light, or of all where they are blurred alike."""
+    def _painted(self, given: Given, plan: Plan, pieces: Sequence[Profile]) -> Tensor:
+        """The picture by one plan alone, of one light, or of all where they are blurred alike."""
         image, signed, motion, ends, behind = given
         moves = motion if plan.moves else None
         ends = ends if plan.approaches else None
@@ -225,7 +242,7 @@ class LensBlur(nn.Module):
         asked = any(t.requires_grad for t in (signed, *ways(moves)))
         dtype = compute_dtype(signed, image)
         with torch.autocast(image.device.type, enabled=False):
-            merging = plan.quality.merging
+            merging, coarse = plan.quality.merging, plan.quality.coarse
             source, radii = image.to(dtype).contiguous(), signed.to(dtype).contiguous()
             still = moves is None and ends is None
             moving = partial(moving_picture, image, moves, ends, plan.parts, self.shutter)
@@ -236,11 +253,11 @@ class LensBlur(nn.Module):
                     Surface(colour[:, k], None if k in opaque else cover[:, k], radii[:, k], bins, moving(k))
                     for k, bins in zip(plan.layers, plan.bins, strict=True)
                 ]
-                if merging is None or not still:
+                if not (coarse and still):
                     surfaces = [s.continued() for s in surfaces]
                 if not surfaces:
                     return torch.zeros_like(source[:, 0])
-                return torch.cat(compose(surfaces, pieces, merging, plan.highest), 1)
+                return torch.cat(compose(surfaces, pieces, merging, plan.highest, coarse=coarse), 1)
             if plan.uniform is not None and not asked:
                 return self._convolved(source, plan, plan.uniform)
             if len(plan.bins) == 2:
@@ -279,7 +296,7 @@ class LensBlur(nn.Module):
         if merging is not None and coarse and simple and has_kernel(image):
             return foreground_over_rest(image.detach(), radii.detach(), plan.bins, pieces[0], merging, plan.highest)
         surfaces = split_foreground(image, radii, behind, plan.bins, COARSE if coarse else 1, moving)
-        return compose(surfaces, pieces, merging, plan.highest)[0]
+        return compose(surfaces, pieces, merging, plan.highest, coarse=coarse)[0]
 
     def _inputs(
         self,

@@ -80,6 +80,8 @@ class Plan(Seen):
         predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
         colours: the lights that a lens with dispersion takes a picture in, one by one; none where that is not seen.
         spread: how far it spreads them in px, in radius and place.
+        fading: plans with a part less, and how much their pictures count for in a mean with that of this plan: where a
+            part begins to be needed, it does so gradually.
     """
 
     sharp: bool
@@ -92,6 +94,7 @@ class Plan(Seen):
     predicted_error: float
     colours: tuple["Colour", ...] = ()
     spread: float = 0.0
+    fading: tuple[tuple["Plan", float], ...] = ()
 
     @property
     def uniform(self) -> float | None:
@@ -102,6 +105,12 @@ class Plan(Seen):
         if self.moves:
             return low if self.pan is not None and not self.approaches else None
         return low if self.highest == 0 and abs(low) >= CONVOLVE_FROM else None
+
+    @property
+    def cuts(self) -> list[int]:
+        """All numbers of sub-apertures each way that occur in it and in its parts."""
+        others = [*(one.plan for one in self.colours), *(other for other, _ in self.fading)]
+        return sorted({self.subapertures, *(count for other in others for count in other.cuts)})
 
     def __str__(self) -> str:
         height, width = self.size
@@ -141,6 +150,9 @@ class Plan(Seen):
             )
         elif self.quality.merging is not None:
             lines.append(f"Quality {self.quality.name!r}: the blur is too small for pixels to be merged.")
+        if self.fading:
+            share = sum(share for _, share in self.fading)
+            lines.append(f"Part of this is hardly needed yet: {100 * share:.2g} % of the picture do without.")
         if self.clamped:
             lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
         return "\n".join(lines)

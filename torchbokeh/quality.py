@@ -19,7 +19,8 @@ class Quality(NamedTuple):
             from 12 to 80 px. `torchbokeh report` measures it anew.
         bins: most soft bins of a surface in a composition.
         subapertures: most pieces of the lens each way where hidden content is guessed, and where it is known.
-        coarse: hidden content is filled in blocks of pixels, and the foreground of a plain image is one bin.
+        coarse: hidden content is filled in blocks of pixels, and the density of splats is found in such; the foreground
+            of a plain image is one bin.
     """
 
     name: str

@@ -1,5 +1,6 @@
 """`LensBlur` of lenses with dispersion: closed forms of dots, what must not change, gradients, and what is refused."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import torchbokeh as tb
-from torchbokeh.dispersion import RGB, Dispersion
+from torchbokeh.dispersion import RGB, SEEN, Dispersion
 from torchbokeh.field_map import Field, FieldMap
 from torchbokeh.lens import Lens
 
@@ -214,6 +215,25 @@ def test_a_plan_made_earlier_is_the_plan(spectrum: Any) -> None:
     assert torch.equal(blur(image, coc=coc), blur(image, depth))
 
 
+@pytest.mark.parametrize("spectrum", ["rgb", "continuous"])
+def test_colours_come_gradually(spectrum: Any) -> None:
+    image, depth = picture(), uneven()
+
+    def blur(axial: float) -> tb.LensBlur:
+        return tb.LensBlur(camera(Dispersion("SF10", axial, spectrum=spectrum), 0.5))
+
+    strength = 0.075 / blur(1.0).plan(image, depth).spread
+    plan = blur(strength).plan(image, depth)
+    ((plain, share),) = plan.fading
+    assert plain == blur(0.0).plan(image, depth)
+    assert share == pytest.approx(2 - plan.spread / SEEN)
+    assert 0.4 < share < 0.7
+    coloured = blur(strength)(image, depth, plan=dataclasses.replace(plan, fading=()))
+    want = torch.lerp(coloured, blur(0.0)(image, depth), share)
+    assert torch.allclose(blur(strength)(image, depth), want, atol=1e-6)
+    assert blur(2 * strength).plan(image, depth).fading == ()
+
+
 def test_the_plan_says_how_colours_spread() -> None:
     image, depth = picture(), uneven()
     lens = camera(Dispersion("SF10", 1.0, axial_map=None), 0.5)
@@ -259,6 +279,19 @@ def test_one_opaque_layer_is_a_plain_picture(strength: dict[str, Any]) -> None:
     out = blur(as_layer(image), (2.5 + x)[:, None])
     torch.testing.assert_close(out[:, :3], blur(image, 2.5 + x), atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(out[:, 3:], torch.ones(1, 1, H, W), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("strength", STRONG)
+def test_half_precision_is_worked_on_in_single(strength: dict[str, Any], dtype: torch.dtype) -> None:
+    blur = tb.LensBlur(camera(Dispersion("BK7", **strength)))
+    image, motion = picture().to(dtype), torch.full((1, 2, H, W), 3.0, dtype=dtype)
+    coc = (uneven() - 3).to(dtype)
+    for moves in ({}, {"motion": motion}):
+        out = blur(image, coc=coc, **moves)
+        want = blur(image.float(), coc=coc.float(), **{k: t.float() for k, t in moves.items()})
+        assert out.dtype == dtype
+        torch.testing.assert_close(out, want.to(dtype), atol=2e-6, rtol=torch.finfo(dtype).eps)
 
 
 def test_a_batch_is_one_by_one() -> None:

@@ -209,6 +209,19 @@ def test_bands_are_about_a_pixel_apart(axial: float, what: str) -> None:
     assert float(steps.max()) < 1.5
 
 
+@pytest.mark.parametrize("border", [3.0, 4.0, 7.0, 25.0, 64.0])
+def test_bands_come_without_a_jump(border: float) -> None:
+    dispersion = Dispersion("BK7", 1.0, spectrum="continuous")
+    sums = []
+    for spread in (border - 1e-6, border + 1e-6):
+        light = dispersion.light(spread)
+        rgb = torch.tensor([one.rgb for one in light], dtype=F64)
+        wavelengths = torch.tensor([one.wavelength for one in light], dtype=F64)
+        waves = torch.stack([torch.cos(wavelengths / 400 * k) for k in range(1, 30)])
+        sums.append(waves @ rgb)  # changes with any light that moves, comes or goes
+    torch.testing.assert_close(*sums, rtol=0, atol=1e-4)
+
+
 def test_batches_of_strengths() -> None:
     strengths = torch.tensor([0.2, 1.0, 0.0], dtype=F64)
     dispersion = Dispersion("F2", axial=strengths, lateral=0.1 * strengths)

@@ -52,12 +52,26 @@ def test_bins_lie_evenly_from_the_nearest_to_the_farthest(low: float, extent: fl
     if len(centres) == 1:
         assert centres[0] == pytest.approx(low + extent / 2)
         return
-    assert (centres[0], centres[-1]) == pytest.approx((low, low + extent))
     steps = torch.tensor(centres, dtype=F64).diff()
     assert torch.allclose(steps, steps.mean().expand_as(steps))
     assert steps.min() > 0
-    if len(centres) < most:
+    assert centres[-1] >= low + extent - 1e-6
+    if extent >= 2:
+        assert centres[0] == pytest.approx(low)
+        assert centres[-2] < low + extent
+    if 2 < len(centres) < most:
         assert steps.max() <= SPACING + 1e-9
+
+
+@few
+@given(low=st.floats(-80, 80), extent=st.sampled_from([1.0, 2.0, 6.0, 12.0, 18.0, 42.0]), most=st.integers(1, 12))
+def test_bins_come_and_move_without_a_jump(low: float, extent: float, most: int) -> None:
+    coc = torch.linspace(low, low + extent, 50, dtype=F64).view(1, 1, 1, -1)
+    before, after = (bin_weights(coc, bin_centres(low, low + extent + s, most)) for s in (-1e-6, 1e-6))
+    nothing = torch.zeros_like(coc)
+    for k in range(max(len(before), len(after))):
+        pair = [w[k] if k < len(w) else nothing for w in (before, after)]
+        assert float((pair[0] - pair[1]).abs().max()) < 1e-5
 
 
 @pytest.mark.parametrize(

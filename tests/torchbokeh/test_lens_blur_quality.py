@@ -41,7 +41,9 @@ def test_fused_passes_equal_the_composition(size: tuple[int, int, int, int], qua
     assert plan.hidden == "filled"
     profile, merging = blur.aperture.profile(), plan.quality.merging
     assert merging is not None
-    want, _ = compose(split_foreground(image, coc, None, plan.bins, COARSE), [profile], merging, plan.highest)
+    want, _ = compose(
+        split_foreground(image, coc, None, plan.bins, COARSE), [profile], merging, plan.highest, coarse=True
+    )
     got = foreground_over_rest(image, coc, plan.bins, profile, merging, plan.highest)
     assert (got - want).abs().max() < 1e-4 * want.abs().max()
     torch.testing.assert_close(blur(image, coc=coc), got, rtol=0, atol=0)

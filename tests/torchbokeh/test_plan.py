@@ -7,7 +7,7 @@ from torch import Tensor
 
 import torchbokeh as tb
 from torchbokeh import KernelSplatting, LensBlur, Plan
-from torchbokeh.layers import FOREGROUND
+from torchbokeh.layers import FOREGROUND, SPACING
 from torchbokeh.quality import QUALITIES
 
 
@@ -57,8 +57,9 @@ def test_what_a_plan_says_of_a_scene() -> None:
     assert plan.layers == ()
     assert plan.hidden == "filled"
     front, rest = plan.bins
-    assert (front[0], front[-1]) == (-9.0, FOREGROUND[1])
-    assert (rest[0], rest[-1]) == (FOREGROUND[0], 8.0)
+    assert front == (-9.0, -9.0 + SPACING, -9.0 + 2 * SPACING)
+    assert rest == (FOREGROUND[0], FOREGROUND[0] + SPACING, FOREGROUND[0] + 2 * SPACING)
+    assert plan.fading == ()
     assert plan.aperture == "Polygon(blades=6, rotation=0, curvature=0)"
 
 
@@ -175,6 +176,54 @@ def test_how_finely_the_lens_is_cut_for_layers() -> None:
     assert side(-8, 8) == 3
     assert side(-2, 2) == 1
     assert side(8) == 1
+
+
+def uniform_motion(length: float) -> Tensor:
+    return torch.tensor([length, 0.0]).view(1, 2, 1, 1).expand(1, 2, 24, 32)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "length", "without"),
+    [
+        (-2.25, -0.75, 0.0, {("nothing", 1, False): 0.5}),  # a foreground, from an extent of 1 px on
+        (1.0, 2.25, 0.0, {}),  # nothing that hides anything, and no blur to cut the lens for
+        (-2.5, 3.25, 0.0, {("filled", 1, False): 0.75}),  # sub-apertures, from a radius of 3 px on
+        (2.25, 3.75, 0.0, {("nothing", 1, False): 0.625}),  # likewise, where bins begin to hide one another
+        (-8.0, 8.0, 0.625, {("filled", 2, False): 0.75}),  # motion, from half a pixel on
+        (-8.0, -1.75, 0.0, {("nothing", 2, False): 0.75}),  # the rest, where nearly all is foreground
+        (  # all of these at once
+            -3.5,
+            -1.5,
+            0.75,
+            {
+                ("nothing", 1, False): 0.125,
+                ("nothing", 2, False): 0.125,
+                ("filled", 1, False): 0.125,
+                ("filled", 2, False): 0.125,
+                ("nothing", 1, True): 0.25,
+            },
+        ),
+    ],
+)
+def test_parts_of_a_plan_come_gradually(left: float, right: float, length: float, without: dict[Any, float]) -> None:
+    blur, image, coc, motion = LensBlur(), picture(), halves(left, right), uniform_motion(length)
+    plan = blur.plan(image, coc=coc, motion=motion)
+    found = {(p.hidden, p.subapertures, p.moves): share for p, share in plan.fading}
+    assert found == pytest.approx(without)
+    want = (1 - sum(share for _, share in plan.fading)) * blur(image, coc=coc, motion=motion, plan=alone(plan))
+    for other, share in plan.fading:
+        want = want + share * blur(image, coc=coc, motion=motion, plan=other)
+    assert torch.allclose(blur(image, coc=coc, motion=motion), want, atol=1e-6)
+    assert ("hardly needed" in str(plan)) == bool(without)
+
+
+def alone(plan: Plan) -> Plan:
+    return dataclasses.replace(plan, fading=())
+
+
+def test_a_lens_that_is_cut_by_request_is_cut_at_once() -> None:
+    assert LensBlur(subapertures=3).plan(picture(), coc=halves(-2.5, 3.25)).fading == ()
+    assert LensBlur(quality="fast").plan(picture(), coc=halves(-2.5, 3.25)).fading == ()
 
 
 @pytest.mark.parametrize(("layers", "most"), [("auto", QUALITIES[0].bins), (1, 1), (3, 3), (20, 20)])
