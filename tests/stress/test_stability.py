@@ -7,15 +7,28 @@ import pytest
 import torch
 
 from torchbokeh.report import stability_checks as checks
-from torchbokeh.report.stability import QUICK, render_rows
+from torchbokeh.report.stability import QUICK, render_rows, rows_of
 from torchbokeh.report.stability_bounds import PRECISIONS
-from torchbokeh.report.stability_cases import Case, beyond, even
+from torchbokeh.report.stability_cases import Case, beyond, cases, even
 from torchbokeh.report.stability_mechanisms import mechanism_rows
+from torchbokeh.report.stability_options import options
+from torchbokeh.report.stability_renderer import Renderer
 from torchbokeh.report.stability_renderers import renderers
 from torchbokeh.report.stability_rows import row
+from torchbokeh.report.stability_scenes import scene_rows
 from torchbokeh.report.stability_sweeps import plan_rows, sweep_rows
 
-NAMES = [r.name for r in renderers()]
+NAMES, OPTIONS = [r.name for r in renderers()], list(options())
+PLAIN = [name for name in NAMES if name not in [r.name for r in OPTIONS]]
+STIFFEST = (
+    "1e+06 beside grey",
+    "denormal (1e-40)",
+    "even, 10000 px",
+    "2000 px",
+    "up to 2000 px, anywhere",
+    "1 x 1",
+    "batch of 0",
+)
 
 
 def all_kept(rows) -> int:
@@ -39,15 +52,35 @@ def test_far_is_beyond_the_reach_of_every_highlight() -> None:
     assert int((~beyond(case, 1.0, mirrored=True)).sum()) == 10
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PLAIN)
 def test_pictures_keep_their_bounds_in_single_precision(name: str) -> None:
     assert all_kept(render_rows(12, PRECISIONS[1:2], [name])) > 50
 
 
+@pytest.mark.parametrize(
+    "renderer",
+    # Of two qualities, the quicker one.
+    [r for r in OPTIONS if r.name.replace("exact", "balanced") == r.name or r.kind == "composed"],
+    ids=lambda renderer: renderer.name,
+)
+def test_options_keep_their_bounds_in_the_stiffest_cases(renderer: Renderer) -> None:
+    chosen = [case for case in cases(8) if case.name in STIFFEST and renderer.takes(case)]
+    assert len(chosen) >= 4
+    all_kept(row for case in chosen for row in rows_of(renderer, case, PRECISIONS[1], {}))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PLAIN)
 def test_pictures_keep_their_bounds_in_every_precision(name: str) -> None:
-    assert all_kept(render_rows(16, PRECISIONS, [name])) > 300
+    others = [p for p in PRECISIONS if p.name != "float32"]
+    assert all_kept(render_rows(12, others, [name])) > 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [r.name for r in OPTIONS])
+def test_options_keep_their_bounds(name: str) -> None:
+    chosen = [p for p in PRECISIONS if p.name in ("float64", "float32", "float16")]
+    assert all_kept(render_rows(8, chosen, [name])) > 100
 
 
 @pytest.mark.parametrize("name", ["KernelSplatting, exact", "LensBlur image, balanced"])
@@ -64,7 +97,15 @@ def test_a_highlight_leaks_into_no_pixel_that_it_does_not_reach() -> None:
 
 @pytest.mark.parametrize(
     "part",
-    [checks.lens_rows, checks.integrator_rows, checks.layer_rows, checks.bank_rows, checks.gradient_rows, sweep_rows],
+    [
+        checks.lens_rows,
+        checks.integrator_rows,
+        checks.layer_rows,
+        checks.bank_rows,
+        checks.gradient_rows,
+        scene_rows,
+        sweep_rows,
+    ],
     ids=lambda part: part.__name__,
 )
 def test_parts_keep_their_bounds(part) -> None:
@@ -82,10 +123,9 @@ def test_a_blur_may_be_applied_a_hundred_times_and_descended_a_thousand() -> Non
 
 
 def test_a_change_of_plan_is_no_change_of_picture() -> None:
-    rows = list(plan_rows(32))
-    all_kept(rows)
-    smooth = [r for r in rows if r["case"] in ("sharp, or not", "one radius, or several")]
-    assert max(r["measured"] for r in smooth) < 1e-5
+    rows = list(plan_rows(24))
+    assert all_kept(rows) > 60
+    assert max(r["measured"] for r in rows if not r.get("stated")) < 1e-3
 
 
 @pytest.mark.slow

@@ -1,22 +1,30 @@
-"""What rounding may do, derived from the arithmetic: bounds that every stiff case is held to.
+"""What rounding and approximation may do: bounds that every stiff case is held to.
+
+Those of rounding are derived from the arithmetic. `TIES`, `GRAZING`, `DENSITY`, `BESIDE`, `BORDER`, `far_leak` and the
+errors of qualities are stated, not derived: they say what they were taken from, and rows held to one are marked.
 
 ``u`` is the unit round-off of the dtype in which pictures are held while they are worked on, ``u64`` that of double.
 Weights, ends of rows and running sums are double in float32 as well, so errors of the sums count with ``u64``.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchbokeh.bank_splatting import BRIGHT
 from torchbokeh.layer_views import STEPS as STEPS_OF_VIEWS
+from torchbokeh.layers import COARSE, FOREGROUND
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import STEPS
+from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.quality import QUALITIES
 from torchbokeh.report.stability_cases import Case
-from torchbokeh.report.stability_renderers import Renderer, coverage
+from torchbokeh.report.stability_renderer import Renderer
+from torchbokeh.report.stability_renderers import coverage
 
 U64 = torch.finfo(torch.float64).eps / 2
 
@@ -84,17 +92,44 @@ def bound(renderer: Renderer, case: Case, want: Tensor, image: Tensor, coc: Tens
         coc: likewise.
         precision: in which they were given.
     """
-    relative = {"splat": _splat, "merged": _splat, "composed": _composed, "layers": _composed, "views": _views}
-    absolute = relative.get(renderer.kind, _bank)(image, coc, precision)
+    views = partial(_views, motion=renderer.motion(case))
+    bounds: dict[str, Callable[[Tensor, Tensor, Precision], Tensor]]
+    bounds = {"splat": _splat, "merged": _splat, "composed": _composed, "layers": _composed, "views": views}
+    of = (bounds | {"colours": _colours, "rays": views}).get(renderer.kind, _bank)
+    # Whether the radii are the least or the largest: one has the largest weights, the other the least coverage.
+    least, largest = renderer.widths(coc)
+    absolute = of(image, largest, precision)
+    if least is not largest:
+        absolute = torch.maximum(absolute, of(image, least, precision))
     rounded = (STORED * precision.work + precision.store) * want.abs()
-    if renderer.kind in ("layers", "views"):
+    if renderer.kind == "rays":
+        rounded = rounded + GRAZING * (image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True))
+    if renderer.layered:
         # The layers of a case are made in its precision: alpha, colour times alpha, and what is behind are rounded.
         rounded = rounded + 3 * precision.store * image.abs().amax((1, 2, 3), keepdim=True)
-    if renderer.quality != "exact" and renderer.kind != "merged":
-        # A radius that is filled in or averaged may lie on the border of a step and be rounded to the other side: of
-        # 1 px, by 1 / 64 of its light at most, half of it on each side of the rim.
-        absolute = absolute + (image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True)) / STEPS
     return rounded + absolute + DENORMAL * precision.least
+
+
+GRAZING = 1 / 20
+"""Of the contrast of a picture, where sub-samples cast rays through the depth of a view. Stated, not derived.
+
+A surface ends half a pixel from the middle of its last one. A ray that just grazes that end may meet it or not, and
+then sees something else: one of the four rays of a pixel and itself, in a quarter of the views.
+"""
+
+TIES = 1 / STEPS
+"""Of the contrast of a picture, where radii are averaged and then rounded to steps. Stated, not derived.
+
+A radius r that lies on the border of a step may be rounded to the other side in another precision. That moves
+``4 / (64 r)`` of the light of its pixel, which is up to ``1 / (pi r**2)`` of what another pixel receives: 1/50 at 1 px.
+Several such pixels together, or smaller radii, could do more.
+"""
+
+
+def ties(renderer: Renderer, image: Tensor) -> Tensor:
+    """What steps of radii may add to the error against the renderer itself in double, ``(B, 1, 1, 1)``."""
+    contrast = image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True)
+    return TIES * contrast if renderer.quality != "exact" else 0 * contrast
 
 
 def _splat(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
@@ -130,16 +165,33 @@ def _composed(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
     return 4 * OPERATIONS * precision.work * brightest + _splat(image, coc, precision).amax()
 
 
-def _views(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
+def _views(image: Tensor, coc: Tensor, precision: Precision, motion: Tensor | None = None) -> Tensor:
     """Absolute error of the mean of views: that of a composition, and of places in px that are looked up.
 
     A place is the fourth iterate of one that comes to lie on a pixel (`torchbokeh.layer_views.STEPS`). It is held to
-    ``u`` times the size of the picture, and each step multiplies what it is off by the slope of the CoC.
+    ``u`` times the size of the picture and of what moves it, and each step multiplies what it is off by the slope of
+    the CoC and of the motion, of which a view sees half at most: beyond a pixel, anything may be looked up.
     """
-    slopes = [coc.diff(dim=d).abs().max() if coc.shape[d] > 1 else coc.new_zeros(()) for d in (2, 3)]
-    apart = 8 * precision.work * max(image.shape[2:]) * (1 + float(max(slopes))) ** STEPS_OF_VIEWS
+    moving = coc if motion is None else coc.abs() + motion.abs().amax(1, keepdim=True) / 2
+    slope, size = _steepest(coc), max(*image.shape[2:], float(moving.abs().max()))
+    slope += 0.0 if motion is None else _steepest(motion) / 2
+    apart = 8 * precision.work * size * (1 + slope) ** STEPS_OF_VIEWS
     brightest = image.abs().amax((1, 2, 3), keepdim=True)
     return _composed(image, coc, precision) + 2 * min(apart, 1.0) * brightest
+
+
+def _steepest(maps: Tensor) -> float:
+    """Largest difference of two neighbouring pixels."""
+    return max((float(maps.diff(dim=d).abs().max()) for d in (2, 3) if maps.shape[d] > 1), default=0.0)
+
+
+def _colours(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
+    """Absolute error of a mean of compositions, each magnified: that of one, and of places in px that are looked up.
+
+    A place is held to ``u`` times the size of the picture, and light is shared by two pixels each way.
+    """
+    brightest = image.abs().amax((1, 2, 3), keepdim=True)
+    return _composed(image, coc, precision) + 4 * 8 * precision.work * max(image.shape[2:]) * brightest
 
 
 GREEN = 1.3
@@ -166,18 +218,56 @@ def _bank(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
 
 
 def far_leak(case: Case) -> float:
-    """What a highlight may add where its PSF does not reach, over an even background of 1 or none."""
+    """What a highlight may add where its PSF does not reach, over an even background of 1 or none: a promise."""
     return min(1e-6 * case.peak, 1e-3 * max(case.even, 1.0))
 
 
-def merged_error(renderer: Renderer, coc: Tensor) -> float:
-    """Relative L1 error of a quality: what it promises, and radii that are rounded to 1/64 of a pixel or cell.
+DENSITY = 0.08
+"""Relative L1 error of a composition of a picture of one block, and in proportion less with more of them across.
 
-    A disc of radius r differs from one of r + d by ``4 d / r`` of its light, and d is at most half a step.
+Stated, not derived: twice the largest that the cases show, a picture of 2 x 2 px apart. The two fastest qualities find
+the density of a surface with holes in blocks of 4 x 4 px (`torchbokeh.layers.half_density`), in which no radius is
+below 2 px; it is wrong within a block of the border, and so is what a surface is taken to stop there.
+"""
+
+BESIDE = 0.3
+"""Of the light of the brightest pixel, where that lies within a block of the border: it is not spread over a picture of
+which a part is wrong. Stated, not derived: the largest error of a pixel that the cases show, for the reason above."""
+
+BORDER = 1e-3
+"""Relative L1 error where banks are integrated on a torus. Stated, not derived: four times the largest that was seen.
+
+`torchbokeh.ops.integrate.poisson_fft` with ``compact=True`` takes the picture to vanish on the border of its buffer.
+The light of sparse points does so only about: what is left there comes back from all sides. The error has no
+Laplacian, so that it is largest at the border, where it is that of the images that meet there.
+"""
+
+
+def approximation(renderer: Renderer, image: Tensor, coc: Tensor) -> float:
+    """Relative L1 error of a renderer that approximates its definition.
+
+    Splats of a quality have the error that it promises, and radii that are rounded to 1/64 of a pixel or cell: a disc
+    of radius r differs from one of r + d by ``4 d / r`` of its light, and d is at most half a step. Over one another,
+    surfaces F and R with the share s of light that F stops are ``s F + (1 - s) R``, whose error is at most
+    ``s dF + (1 - s) dR + ds |F - R|``: once more that of a splat for a surface that hides something.
     """
     quality = next(q for q in QUALITIES if q.name == renderer.quality)
-    least = float(coc.abs().clamp_min(1.0).min())
-    return quality.error + 4 * 0.5 / STEPS / least
+    border = 0.0 if renderer.bank is None else BORDER
+    if quality.merging is None:
+        return border
+    light = image.abs().sum(1, keepdim=True)
+    share = light / light.sum().clamp_min(1e-300)
+    steps = 4 * 0.5 / STEPS * float((share / coc.abs().clamp_min(MIN_RADIUS)).sum())
+    hides = renderer.kind == "layers" or (renderer.kind != "merged" and float(coc.min()) < FOREGROUND[1])
+    if not hides:
+        return quality.error + steps + border
+    twice = 2 * (quality.error + steps) + border
+    if not quality.coarse:
+        return twice
+    blocks = math.ceil(min(image.shape[2:]) / COARSE)
+    beside = share.clone()
+    beside[..., COARSE:-COARSE, COARSE:-COARSE] = 0
+    return twice + DENSITY / blocks + BESIDE * float(beside.max())
 
 
 def lipschitz(contrast: float, radius: float, covered: float) -> float:

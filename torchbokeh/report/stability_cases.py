@@ -112,7 +112,7 @@ def radii(side: int) -> Iterator[Case]:
 
 
 def motions(side: int) -> Iterator[Case]:
-    """No motion, hardly any, far more than the picture is wide, in opposite directions, along axes and diagonals."""
+    """No motion, hardly any, far more than the picture is wide; along axes and diagonals, in opposite ways, in any."""
     group, image, coc = "motion", texture(side, side), even(side, side, side / 16)
     ways = {
         "none": (0.0, 0.0),
@@ -129,6 +129,10 @@ def motions(side: int) -> Iterator[Case]:
     signs = torch.where((torch.arange(side) // 4) % 2 == 0, 1.0, -1.0).double()
     opposite = torch.stack([signs * side / 4, 0 * signs])[:, None, :].expand(2, side, side)[None].contiguous()
     yield Case(group, "opposite, side by side", image, slope(side, side, 0.5, side / 16), opposite)
+    draw = torch.Generator().manual_seed(2)
+    angle, length = (torch.rand(1, 1, side, side, dtype=torch.float64, generator=draw) for _ in range(2))
+    anywhere = 2000 * length * torch.cat([torch.cos(2 * math.pi * angle), torch.sin(2 * math.pi * angle)], 1)
+    yield Case(group, "up to 2000 px, anywhere", image, coc, anywhere)
 
 
 def sizes(side: int) -> Iterator[Case]:
@@ -155,7 +159,13 @@ def beyond(case: Case, reach: float, *, mirrored: bool) -> Tensor:
     return far
 
 
-def reach_of(case: Case, motion: Tensor | None) -> float:
-    """How far in px the PSFs of a case reach; 3 px more than the disc or capsule of any pixel."""
+def reach_of(coc: Tensor, motion: Tensor | None, ahead: float = 0.5) -> float:
+    """How far in px PSFs reach; 3 px more than the disc or capsule of any pixel.
+
+    Args:
+        coc: their radii.
+        motion: of them.
+        ahead: how far they go along that, as a share of its length.
+    """
     way = 0.0 if motion is None or not motion.numel() else float(motion.square().sum(1).sqrt().max())
-    return float(case.coc.abs().max()) + way / 2 + 3.0 if case.coc.numel() else math.inf
+    return float(coc.abs().max()) + ahead * way + 3.0 if coc.numel() else math.inf

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh import bank_splatting
+from torchbokeh import bank_samples, bank_splatting
 from torchbokeh._signed import WIDEST
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator
 from torchbokeh.kernel_splatting import KernelSplatting
@@ -21,7 +21,7 @@ from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.combined import capsule
 from torchbokeh.psfs.refit import drawn
 from torchbokeh.report.stability_cases import even, slope
-from torchbokeh.report.stability_renderers import bank_of
+from torchbokeh.report.stability_renderer import bank_of
 
 Mechanism = dict[str, Any]
 
@@ -165,10 +165,17 @@ def _reciprocals() -> Mechanism:
 
 
 def _confined(side: int) -> Mechanism:
-    """Pixels of a buffer around the discs of motion that are far wider than the picture, in millions."""
-    wide, enough = 1e4, 1.5 * 6 + math.hypot(side, side) + 1
-    return _row(
-        "discs no wider than the picture asks for",
-        "Mpx of a buffer, radius 1e4",
-        *(4e-6 * r**2 for r in (wide, enough)),
-    )
+    """Pixels of the buffer around a small picture whose ways are far longer than it is wide, in millions."""
+    small, sizes = max(side // 4, 8), []
+    way = torch.full((1, 2, small, small), 20.0 * small)
+    image, coc = torch.ones(1, 3, small, small), even(small, small, 3.0).float()
+
+    def integrated(buffer: Tensor, *, compact: bool) -> Tensor:
+        sizes.append(1e-6 * buffer.shape[2] * buffer.shape[3])
+        return poisson_fft(buffer, compact=compact)
+
+    with mock.patch.object(bank_samples, "poisson_fft", integrated):
+        for extreme in (False, True):
+            with mock.patch.object(bank_splatting, "_far_beyond", lambda *_, found=extreme: found):
+                KernelSplatting(quality="exact", bank=bank_of("combined"))(image, coc, motion=way)
+    return _row("ways no longer than the picture asks for", f"Mpx of a buffer, {small} x {small} px", *sizes)

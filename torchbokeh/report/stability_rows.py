@@ -22,7 +22,7 @@ def row(renderer: str, case: Case | str, precision: str, what: str, measured: fl
         what: was measured.
         measured: the number.
         limit: its bound.
-        more: anything else to keep.
+        more: anything else to keep; ``stated=True`` where the bound is not derived.
     """
     group, name = (case.group, case.name) if isinstance(case, Case) else case.split(": ", 1)
     return {

@@ -6,7 +6,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchbokeh.dispersion import FEWEST, SEEN, Dispersion, Spectrum
 from torchbokeh.kernel_splatting import KernelSplatting
+from torchbokeh.lens import ThinLens
 from torchbokeh.lens_blur import LensBlur
 from torchbokeh.ops.merge import FADE, STEPS
 from torchbokeh.quality import QUALITIES
@@ -18,9 +20,15 @@ from torchbokeh.report.stability_rows import Row, row
 STEP = 1 / STEPS
 """Change of all radii in px: that of merged ones in cells, so that each step shows."""
 
-JUMP = 0.02
-"""Relative L1 that a picture may jump by where a plan changes: stated, not derived. A plan chooses between two
-approximations of one composition, and both are off by some hundredths at silhouettes."""
+STEEPEST = 128.0
+"""How steeply a picture may change with what decides on its plan, as a share of its contrast per px.
+
+The splats of 1/2 px change by 16 per px, and where they thin out to a quarter of their density, by 64 (`lipschitz`);
+parts of a plan come in over half a pixel or more, the foreground over 1 px: 4 per px in all, on each of those.
+"""
+
+PARTS = 0.005
+"""Relative L1 that a picture may jump by where an approach is cut into one more part: stated, not derived."""
 
 
 def sweep_rows(side: int) -> Iterator[Row]:
@@ -52,36 +60,74 @@ def sweep_rows(side: int) -> Iterator[Row]:
 
 
 def plan_rows(side: int, width: float = 1e-5) -> Iterator[Row]:
-    """By how much a picture jumps where its plan changes, as relative L1 and at worst; below `JUMP`."""
+    """By how much a picture changes where its plan does, over twice that width in px, at the worst pixel.
+
+    Where a plan takes up one more part, the pictures with and without it are mixed, so that nothing jumps. What is left
+    is the number of parts that an exposure is cut into, as relative L1.
+
+    Args:
+        side: of the pictures in px.
+        width: see above.
+    """
     image, ramp = texture(side, side), slope(side, side, 0.0, 1.0)
     edge = (torch.arange(side) > side // 2).double().expand(1, 1, side, side)
-    changes: dict[str, Callable[[float], Tensor]] = {
-        "sharp, or not": lambda s: 0.5 + s - 0.7 * edge,
-        "one radius, or several": lambda s: 10 + max(s, 0.0) * ramp,
-        "foreground appears at -1 px": lambda s: -1 + s + 5 * ramp,
-        "foreground appears at a range of 1 px": lambda s: -1.5 + (1 + s) * ramp,
-        "one bin, or two": lambda s: 4 + (1 + s) * ramp,
-        "two bins, or three": lambda s: 4 + (6 + s) * ramp,
-        "sub-apertures from 3 px": lambda s: -2 + (5 + s) * ramp,
-        "sub-apertures from 3 px, at an edge": lambda s: -2 + (5 + s) * edge,
+    way = torch.tensor([0.6, 0.8], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, side, side)
+    behind = texture(side, side, seed=3)
+    layers = torch.stack([torch.cat([image * edge, edge], 1), torch.cat([behind, torch.ones_like(edge)], 1)], 1)
+    changes: dict[str, Callable[[LensBlur, float], Tensor]] = {
+        "sharp, or not": lambda blur, s: blur(image, coc=0.5 + s - 0.7 * edge),
+        "one radius, or several": lambda blur, s: blur(image, coc=10 + max(s, 0.0) * ramp),
+        "foreground appears at -1 px": lambda blur, s: blur(image, coc=-1 + s + 5 * ramp),
+        "foreground appears at a range of 1 px": lambda blur, s: blur(image, coc=-1.5 + (1 + s) * ramp),
+        "rest appears at -2 px": lambda blur, s: blur(image, coc=-7 + (5 + s) * edge),
+        "foreground over a known background": lambda blur, s: blur(image, coc=-1 + s + 5 * ramp, background=behind),
+        "one bin, or two": lambda blur, s: blur(image, coc=4 + (1 + s) * ramp),
+        "two bins, or three": lambda blur, s: blur(image, coc=4 + (6 + s) * ramp),
+        "sub-apertures from 3 px": lambda blur, s: blur(image, coc=-2 + (5 + s) * ramp),
+        "sub-apertures from 3 px, at an edge": lambda blur, s: blur(image, coc=-2 + (5 + s) * edge),
+        "sub-apertures of layers": lambda blur, s: blur(layers, coc=torch.stack([-3 + s - edge * 0, 2 * edge], 1)),
+        "motion from 0.5 px": lambda blur, s: blur(image, coc=-6 + 10 * ramp, motion=(0.5 + s) * way),
+        "approach from 0.5 px": lambda blur, s: blur(
+            image, coc=-6 + 10 * ramp, shutter_depth=_ends(-6 + 10 * ramp, 0.5 + s)
+        ),
     }
+    borders: tuple[tuple[Spectrum, float], ...] = ("rgb", SEEN), ("continuous", SEEN), ("continuous", FEWEST + 1.0)
     for quality in QUALITIES:
         blur = LensBlur(quality=quality.name)
-        for name, coc in changes.items():
-            before, after = (blur(image, coc=coc(s)) for s in (-width, width))
-            jump = (before - after).abs()
-            relative = float(jump.sum() / before.abs().sum())
-            yield row(
-                f"LensBlur image, {quality.name}",
-                f"change of plan: {name}",
-                "float64",
-                "relative L1 jump",
-                relative,
-                JUMP,
-                largest=float(jump.max()),
-            )
-    still = LensBlur()
-    way = torch.ones(1, 2, side, side, dtype=torch.float64) / 2**0.5
-    before, after = (still(image, coc=3 + edge, motion=(0.5 + s) * way) for s in (-width, width))
-    jump = float((before - after).abs().sum() / before.abs().sum())
-    yield row("LensBlur motion, exact", "change of plan: motion from 0.5 px", "float64", "relative L1 jump", jump, JUMP)
+        for name, picture in changes.items():
+            worst = float((picture(blur, -width) - picture(blur, width)).abs().max())
+            limit = 2 * width * STEEPEST * float(image.max() - image.min())
+            case = f"change of plan: {name}"
+            yield row(f"LensBlur image, {quality.name}", case, "float64", "largest change", worst, limit)
+        for spectrum, border in borders:
+            yield _colour_row(blur, image, 3.3 + 3 * ramp, spectrum, border)
+        coc = 8 + 4 * ramp
+        before, after = (blur(image, coc=coc, shutter_depth=_ends(coc, 4 + s)) for s in (-width, width))
+        jump = float((before - after).abs().sum() / before.abs().sum())
+        case = "change of plan: two parts of an approach, or three"
+        yield row(f"LensBlur image, {quality.name}", case, "float64", "relative L1 jump", jump, PARTS, stated=True)
+
+
+def _ends(coc: Tensor, change: float) -> Tensor:
+    """CoC when the shutter opens and when it closes."""
+    return torch.cat([coc - change / 2, coc + change / 2], 1)
+
+
+def _colour_row(blur: LensBlur, image: Tensor, depth: Tensor, spectrum: Spectrum, border: float) -> Row:
+    """How much a picture changes where its colours spread by that many px."""
+
+    def with_axial(strength: float) -> LensBlur:
+        lens = ThinLens(0.05, 0.1, 2.0, 0.036, dispersion=Dispersion("BK7", axial=strength, spectrum=spectrum))
+        return LensBlur(lens, quality=blur.quality)
+
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        spread = with_axial(middle).plan(image, depth).spread
+        low, high = (middle, high) if spread < border else (low, middle)
+    width = 1e-5
+    before, after = (with_axial(high * (1 + s))(image, depth) for s in (-width, width))
+    limit = 2 * width * border * STEEPEST * float(image.max() - image.min())
+    case = f"change of plan: {spectrum} colours from {border:g} px"
+    worst = float((before - after).abs().max())
+    return row(f"LensBlur image, {blur.quality}", case, "float64", "largest change", worst, limit)

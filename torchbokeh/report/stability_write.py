@@ -1,16 +1,14 @@
-"""Write the stability chapter: ``stability.md``, ``stability.json`` and plots, each whole or not at all."""
+"""Write the stability chapter: ``stability.md``, ``stability.json`` and plots, all of them or none."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from torchbokeh.image_io import replacing
 from torchbokeh.report.markdown import section, table
 from torchbokeh.report.stability_rows import Row
-from torchbokeh.report.write import DPI
+from torchbokeh.report.write import write_together
 
 SCALED = "share of the bound"
 """What plots show: 1 is the bound."""
@@ -28,22 +26,16 @@ def write_stability(found: dict[str, Any], folder: Path) -> list[Path]:
     """
     rows, mechanisms = found["rows"], found["mechanisms"]
     figures = {"stability_bounds.png": _bounds(rows), "stability_mechanisms.png": _mechanisms(mechanisms)}
-    for name, figure in figures.items():
-        with replacing(folder / name) as temporary:
-            figure.savefig(temporary, dpi=DPI)
-    with replacing(folder / "stability.json") as temporary:
-        temporary.write_text(json.dumps(_plain(found), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with replacing(folder / "stability.md") as temporary:
-        temporary.write_text(stability_markdown(found, list(figures)), encoding="utf-8")
-    return [folder / name for name in ("stability.md", "stability.json", *figures)]
+    return write_together(folder, "stability", stability_markdown(found, list(figures)), _plain(found), figures)
 
 
 def stability_markdown(found: dict[str, Any], plots: list[str]) -> str:
     """The chapter as Markdown: broken bounds first, then the worst case of each renderer, then all of float32."""
     rows: list[Row] = found["rows"]
     broken = [r for r in rows if not r["kept"]]
-    head = f"# Numerical stability\n\n{len(rows)} numbers, each held to a bound that follows from the arithmetic; "
-    head += f"{len(broken)} of them broken. A renderer's worst case is the one nearest to its bound."
+    head = f"# Numerical stability\n\n{len(rows)} numbers, each held to a bound; {len(broken)} of them broken. "
+    head += f"Bounds follow from the arithmetic, but for {sum(map(_stated, rows))} that are stated: a number that "
+    head += "was chosen by what was seen, or is a promise. A renderer's worst case is the one nearest to its bound."
     parts = [head]
     if broken:
         parts.append(section("Broken bounds", _table(broken)))
@@ -67,10 +59,15 @@ def stability_markdown(found: dict[str, Any], plots: list[str]) -> str:
 def _table(rows: list[Row]) -> str:
     header = ["renderer", "group", "case", "precision", "what", "measured", "bound", "verdict"]
     names = header[:5]
-    numbers = [[f"{r[key]:.2g}" for key in ("measured", "bound")] for r in rows]
+    numbers = [[f"{r['measured']:.2g}", f"{r['bound']:.2g}" + " (stated)" * _stated(r)] for r in rows]
     verdicts = ["kept" if r["kept"] else "**broken**" for r in rows]
     lines = [[*(r[n] for n in names), *n, v] for r, n, v in zip(rows, numbers, verdicts, strict=True)]
     return table(header, lines)
+
+
+def _stated(r: Row) -> bool:
+    """Whether a bound is no more than a statement."""
+    return bool(r.get("stated", False))
 
 
 def _order(r: Row) -> tuple[str, str, str]:
