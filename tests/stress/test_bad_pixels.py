@@ -73,11 +73,3 @@ def test_a_bad_pixel_goes_no_farther_than_is_said(name: str, value: float) -> No
         assert (X - x).max() <= RADIUS
     if name in PSF:
         assert (x - X).max() <= RADIUS
-
-
-def test_samples_that_are_not_finite_are_refused() -> None:
-    samples = tb.scenes.samples(*tb.scenes.ramp(size=(6, 8)))
-    colour = samples.colour.clone()
-    colour[..., 3, 3] = torch.nan
-    with pytest.raises(ValueError, match=r"samples.colour: expected finite numbers"):
-        tb.reconstruct(samples._replace(colour=colour))

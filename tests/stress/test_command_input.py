@@ -209,7 +209,7 @@ def test_names_that_are_no_text(folder: Path) -> None:
     assert done.stderr.count(b"\n") == 1
 
 
-def test_a_broken_file_of_each_kind_is_one_line(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_with_a_tiff_is_said_once(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_image("a.tif", torch.rand(1, 3, H, W))
     whole = Path("a.tif").read_bytes()
     for cut in (8, 60, 150, 190, len(whole) - 5):

@@ -18,12 +18,11 @@ import torch
 
 from torchbokeh.flow_io import MAGIC, read_flow
 from torchbokeh.image_io import read_image, read_map
-from torchbokeh.ops._checks import MOST_PIXELS
 from torchbokeh.psfs import PsfBank, SimpleLens
 from torchbokeh.psfs.bank import FARTHEST
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented
-from torchbokeh.scenes import ProceduralDataset, read_shards, write_shards
+from torchbokeh.scenes import read_shards, write_shards
 from torchbokeh.scenes.shards import shard_indices
 
 
@@ -290,8 +289,3 @@ def test_banks_that_do_not_fit_their_model(tmp_path: Path) -> None:
     path.write_bytes(save(load(data), {"torchbokeh": DEEP.decode()}))
     with pytest.raises(ValueError, match="its header cannot be read"):
         PsfBank.load(path)
-
-
-def test_data_sets_of_absurd_pictures_are_refused() -> None:
-    with pytest.raises(ValueError, match=f"resolution: expected at most {MOST_PIXELS} pixels, got 1000000 x 1000000"):
-        ProceduralDataset(resolution=(10**6, 10**6))

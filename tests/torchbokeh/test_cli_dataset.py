@@ -127,9 +127,8 @@ def test_other_settings_are_refused(folder, capsys):
     assert capsys.readouterr().err == message
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_ctrl_c_leaves_whole_shards(folder, workers):
-    flags = ["dataset", "--out", "set", "--count", "40", "--per-shard", "4", "--workers", str(workers)]
+def test_ctrl_c_leaves_whole_shards(folder):
+    flags = ["dataset", "--out", "set", "--count", "40", "--per-shard", "4", "--workers", "2"]
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         f"import torchbokeh.scenes, test_cli_dataset\n"

@@ -24,7 +24,7 @@ SCENE = ["export", "blur", "a.png", "--focus", "2m", "--depth"]
 
 @pytest.mark.slow
 def test_blur(folder, capsys):
-    assert main([*SCENE, "d.npy", "--f-number", "0.02", "--quality", "fast", "-o", "blur.onnx"]) == 0
+    assert main([*SCENE, "d.npy", "--f-number", "0.1", "--layers", "1", "-o", "blur.onnx"]) == 0
     assert "blur.onnx: " in capsys.readouterr().out
     names = [given.name for given in onnxruntime.InferenceSession("blur.onnx").get_inputs()]
     assert names == ["image", "depth", "focus_distance", "f_number"]
