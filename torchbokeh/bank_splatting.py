@@ -7,26 +7,17 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchbokeh.bank_highlights import dense_highlights, light_of, needed, support, tiers, usual
 from torchbokeh.bank_samples import located, splat_samples, spreading
 from torchbokeh.ops._checks import check_image
-from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import LEAST_CONTRAST, SPREAD, Merging, highest_level, merged
+from torchbokeh.ops.merge import SPREAD, Merging, highest_level, merged
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels
-
-BRIGHT = 0.5
-"""A pixel is a highlight where its light, spread over its PSF, is this many times the mean of the picture."""
-
-MOST = 4096
-"""Highlights that are drawn densely, at most: the brightest."""
-
-CLIPPED = 3
-"""How often the mean of a picture is taken anew, without what is far above the last one."""
 
 
 @lru_cache(maxsize=4)
@@ -146,7 +137,37 @@ def splat_bank(
     parts = [located(p, bank, values) for p in ([labels] if isinstance(labels, Labels) else labels)]
     extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
     values = values if len(parts) == 1 else values / len(parts)
-    dense, values = _highlights(values, parts, bank, interpolate, extreme)
+    if not values.numel():
+        return torch.zeros_like(values)
+    lit = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
+    ordinary = usual(torch.stack([one for one, _ in lit]).mean(0) if extreme else values)
+    dense, values = dense_highlights(values, lit, ordinary, bank, interpolate)
+
+    count = bank.values.shape[1]
+    lowest, *brighter = tiers(values, count)
+    if not brighter:
+        return dense + _splat(values, parts, bank, merging, highest, interpolate, extreme)
+    lower = torch.cat([values[:, :-count] * lowest, values[:, -count:]], 1)
+    out = dense + _splat(lower, parts, bank, merging, highest, interpolate, extreme)
+    for bright in brighter:
+        # As where discs are merged, what is bright is not; beyond its support it is dark, and nowhere less than that.
+        source = light_of(values, count) * bright
+        apart = _splat(source, parts, bank, None, 0, interpolate, extreme)
+        apart = apart if bool((source < 0).any()) else apart.clamp_min(0)
+        out = out + apart * support(bright, [part for _, part in lit], bank)
+    return out
+
+
+def _splat(
+    values: Tensor,
+    parts: Sequence[Labels],
+    bank: PsfBank,
+    merging: Merging | None,
+    highest: int,
+    interpolate: bool,
+    extreme: bool,
+) -> Tensor:
+    """`splat_bank` of values that are all spread alike; ``extreme`` says that `_confined` has something to do."""
 
     def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
         out = torch.zeros_like(cells)
@@ -172,14 +193,14 @@ def splat_bank(
         return out + splat_samples(moving, bank, size, interpolate) if moving else out
 
     if merging is None or highest == 0:
-        return dense + splat(values, parts, 1)
+        return splat(values, parts, 1)
     varies = any(part.coc is not parts[0].coc for part in parts)
     coc = torch.stack([needed(p).abs() for p in parts]).amin(0) if varies else needed(parts[0])
     # Bins and layers are parts of a picture, and need not have its largest radii.
     largest = float(torch.where(spreading(values)[:, None], coc.detach().abs(), 0.0).max())
     highest = min(highest, highest_level(largest, (values.shape[2], values.shape[3]), merging))
     if highest == 0:
-        return dense + splat(values, parts, 1)
+        return splat(values, parts, 1)
     maps = [torch.cat([packed(p), needed(p).abs()], 1) if varies else packed(p) for p in parts]
 
     def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
@@ -194,7 +215,7 @@ def splat_bank(
             now.append(unpacked(own, mean[:, :-1], part))
         return splat(cells, now, size)
 
-    return dense + merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
+    return merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
 
 
 def _far_beyond(values: Tensor, parts: Sequence[Labels]) -> bool:
@@ -241,70 +262,3 @@ def _confined(values: Tensor, part: Labels, size: int) -> tuple[Tensor, Labels]:
     motion, offset = (torch.where(there, t, 0.0) for t in (share * motion, offset + middle * motion))
     coc = torch.where(there, coc, torch.where(wide, diagonal, 0.0))
     return values * light, part._replace(coc=coc, motion=motion, offset=offset)
-
-
-def _highlights(
-    values: Tensor, parts: Sequence[Labels], bank: PsfBank, interpolate: bool, extreme: bool
-) -> tuple[Tensor | float, Tensor]:
-    """What pixels spread that are so bright that the ripples of a sparse PSF would be seen, and all other values."""
-    if not values.numel():
-        return 0.0, values
-    seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
-    with torch.no_grad():
-        light = torch.stack([lit for lit, _ in seen]).mean(0) if extreme else values
-        bound = _usual(light) * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
-        excess = (light.abs() / bound.clamp_min(TINY)).amax(1).flatten()
-        pixels = (excess > 1).nonzero()[:, 0]
-        if len(pixels) > MOST:
-            pixels = excess.topk(MOST).indices.sort().values
-    if not len(pixels):
-        return 0.0, values
-    flat = values.movedim(1, 0).reshape(values.shape[1], -1)
-    shape = (values.shape[1], values.shape[0], *values.shape[2:])
-    rest = flat.index_fill(1, pixels, 0.0).reshape(shape).movedim(0, 1)
-    if not isinstance(bank.model, Combined):
-        only = torch.zeros_like(excess).index_fill(0, pixels, 1.0).reshape(-1, 1, *values.shape[2:])
-        return splat_samples([(values * only, part) for part in parts], bank, 1, interpolate, dense=True), rest
-
-    def of(t: Tensor) -> Tensor:
-        return t.movedim(1, -1).flatten(0, 2)[pixels]
-
-    dense = torch.zeros_like(values)
-    for lit, part in seen:
-        way = of(torch.zeros_like(values[:, :2]) if part.motion is None else part.motion)
-        centre = torch.zeros_like(way) if part.offset is None else of(part.offset)
-        dense = dense + splat_capsules(lit, pixels, of(needed(part))[:, 0].abs(), way, centre)
-    return dense, rest
-
-
-def _usual(values: Tensor) -> Tensor:
-    """What each pixel would show ``(B, C, H, W)`` were it no highlight: none raises it, so that none hides another."""
-    brightness, coverage = values.abs(), values[:, -1:].abs()
-    alive = (values != 0).any(1, keepdim=True).to(values.dtype)
-    mean = coverage.sum((2, 3), keepdim=True) / alive.sum((2, 3), keepdim=True).clamp_min(1)
-    coverage = coverage.maximum(mean) * alive
-    total = coverage.sum((2, 3), keepdim=True).clamp_min(TINY)
-    usual = brightness.sum((2, 3), keepdim=True) / total
-    for _ in range(CLIPPED):
-        usual = brightness.minimum(LEAST_CONTRAST * usual * coverage).sum((2, 3), keepdim=True) / total
-    return usual * coverage
-
-
-def _area(parts: Sequence[Labels], bank: PsfBank) -> Tensor:
-    """About how many pixels the light of each is spread over, ``(B, 1, H, W)``."""
-    if not isinstance(bank.model, Combined):
-        places = [place for part in parts for place in bank.model.places(part)]
-        reach = [bank.reach()[bank.model.grid.index(p.coordinates.movedim(1, -1))][:, None] for p in places]
-        scales = [1.0 if p.scale is None else p.scale for p in places]
-        return torch.stack([(r * s).square() for r, s in zip(reach, scales, strict=True)]).mean(0)
-    radius = torch.stack([needed(p).abs().clamp_min(MIN_RADIUS) for p in parts]).mean(0)
-    ways = [p.motion for p in parts if p.motion is not None]
-    length = torch.stack([way.square().sum(1, keepdim=True).sqrt() for way in ways]).sum(0)
-    return radius * (math.pi * radius + 2 * length) / len(parts)
-
-
-def needed(labels: Labels) -> Tensor:
-    """The CoC of labels that must have one."""
-    if labels.coc is None:
-        raise ValueError("labels.coc: expected one, since pixels are merged by it, got none")
-    return labels.coc

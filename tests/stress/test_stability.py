@@ -95,6 +95,16 @@ def test_a_highlight_leaks_into_no_pixel_that_it_does_not_reach() -> None:
     all_kept(rows)
 
 
+MOVING = [r.name for r in renderers() if r.bank is not None]
+
+
+def test_a_field_of_highlights_leaks_no_more_than_one() -> None:
+    rows = list(checks.field_rows(MOVING))
+    assert [r["renderer"] for r in rows] == MOVING
+    assert all(r["pixels"] > 1000 for r in rows)
+    all_kept(rows)
+
+
 @pytest.mark.parametrize(
     "part",
     [

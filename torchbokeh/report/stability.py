@@ -21,6 +21,7 @@ from torchbokeh.report.stability_cases import Case, beyond, cases
 from torchbokeh.report.stability_checks import (
     bank_rows,
     descent_rows,
+    field_rows,
     gradient_rows,
     highlight_rows,
     integrator_rows,
@@ -55,7 +56,7 @@ class StabilitySettings:
         renderers: names of those that pictures go through; all where there are none.
     """
 
-    side: int = 32
+    side: int = 16
     wide: int = 96
     times: int = 100
     steps: int = 1000
@@ -165,6 +166,7 @@ def run_stability(settings: StabilitySettings, say: Callable[[str], None]) -> di
     parts: dict[str, Callable[[], Iterable[Row]]] = {
         "pictures through renderers": lambda: render_rows(settings.side, names=settings.renderers),
         "highlights": lambda: highlight_rows(settings.wide),
+        "fields of highlights": lambda: field_rows(settings.renderers),
         "sweeps of radii": lambda: sweep_rows(settings.side),
         "changes of plans": lambda: plan_rows(settings.wide // 2),
         "lenses": lambda: lens_rows(settings.side),

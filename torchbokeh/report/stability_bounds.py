@@ -15,7 +15,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchbokeh.bank_splatting import BRIGHT
+from torchbokeh.bank_highlights import BRIGHT
 from torchbokeh.layer_views import STEPS as STEPS_OF_VIEWS
 from torchbokeh.layers import COARSE, FOREGROUND
 from torchbokeh.ops.composite import TINY

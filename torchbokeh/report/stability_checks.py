@@ -1,7 +1,7 @@
 """Stiff cases of single parts: lenses, integrators, layers, banks of odd PSFs, iteration and gradients."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -19,7 +19,7 @@ from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented, laplacian, nonzero
 from torchbokeh.report.stability_bounds import DENORMAL, PRECISIONS, U64
-from torchbokeh.report.stability_cases import beyond, dynamic_range, even, slope, texture
+from torchbokeh.report.stability_cases import Case, beyond, dynamic_range, even, slope, texture
 from torchbokeh.report.stability_renderers import renderers
 from torchbokeh.report.stability_rows import Row, autocast, row
 
@@ -161,6 +161,32 @@ def highlight_rows(side: int) -> Iterator[Row]:
             )
             leak = float((lit - plain)[:, :3, far].abs().max()) if bool(far.any()) else math.nan
             yield row(renderer.name, here, "float32", "far-field leak", leak, 1e-3, pixels=int(far.sum()), stated=True)
+
+
+def field_rows(names: Collection[str] = (), edge: int = 100) -> Iterator[Row]:
+    """A square of 1e4 highlights of 1e6 over a ground of 1, in float32: what it adds beyond the reach of its PSFs.
+
+    Args:
+        names: of the renderers; all where there are none.
+        edge: of the square in px.
+    """
+    side = edge + 140
+    image = torch.ones(1, 3, side, side)
+    image[..., :edge, :edge] = 1e6
+    coc = slope(side, side, 4.5, 5.0)
+    here = Case("highlight", f"{edge} x {edge} of 1e6 over 1", image.double(), coc)
+    column, row_ = torch.arange(side), torch.arange(side)[:, None]
+    for renderer in renderers():
+        if names and renderer.name not in names:
+            continue
+        motion, reach = renderer.motion(here), edge - 1 + renderer.reach(here)
+        way = None if motion is None else motion.float()
+        far = (column > reach) | (row_ > reach)
+        if renderer.layered:
+            far = row_ > reach + 0 * column
+        lit, plain = (renderer.run(t, coc.float(), way) for t in (image, torch.ones_like(image)))
+        leak = float((lit - plain)[:, :3, far].abs().max()) if bool(far.any()) else math.nan
+        yield row(renderer.name, here, "float32", "far-field leak", leak, 1e-3, pixels=int(far.sum()), stated=True)
 
 
 def layer_rows(side: int) -> Iterator[Row]:

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh import bank_samples, bank_splatting
+from torchbokeh import bank_highlights, bank_samples, bank_splatting
 from torchbokeh._signed import WIDEST
 from torchbokeh.integration import FFTIntegrator, PyramidIntegrator
 from torchbokeh.kernel_splatting import KernelSplatting
+from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.convolve import convolve
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import laplacian, poisson_fft
@@ -78,31 +79,37 @@ def _convolution(side: int) -> Mechanism:
 
 
 def _highlights(side: int) -> Iterator[Mechanism]:
-    """Highlights through sparse PSFs like all pixels, and drawn by themselves."""
-    for name, motion in (("combined", (6.0, -3.0)), ("physical-lens", None)):
-        bank = bank_of(name)
-        splatting = KernelSplatting(quality="exact", bank=bank)
-        image = _lit(side).expand(1, 3, side, side).clone()
-        coc, plain = even(side, side, side / 20).float(), torch.ones_like(image)
-        way = None if motion is None else torch.tensor(motion).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
-        far = _far(side, 9.0 * side / 20)
-        leaks = []
-        for most in (0, bank_splatting.MOST):
-            with mock.patch.object(bank_splatting, "MOST", most):
-                lit, dark = splatting(image, coc, motion=way), splatting(plain, coc, motion=way)
-            leaks.append(float((lit - dark)[..., far].abs().max()))
-        yield _row(f"highlights in the direct domain, bank {name}", "far-field leak of 3e5", *leaks)
-    image, at = torch.ones(1, 3, side, side), (side // 4, side // 3)
-    image[..., at[0] - 2 : at[0] + 3, at[1] - 2 : at[1] + 3] = 1e6 / 3
-    coc = even(side, side, side / 5).float()
-    way = torch.full((1, 2, side, side), side / 12)
-    splatting, plain, leaks = KernelSplatting(quality="exact", bank=bank_of("combined")), torch.ones_like(image), []
-    far = _far(side, side / 3)
-    for clipped in (0, bank_splatting.CLIPPED):
-        with mock.patch.object(bank_splatting, "CLIPPED", clipped):
-            lit, dark = splatting(image, coc, motion=way), splatting(plain, coc, motion=way)
-        leaks.append(float((lit - dark)[..., far].abs().max()))
-    yield _row("a mean without highlights to find them by", "far-field leak of 25 times 3e5", *leaks)
+    """Highlights through sparse PSFs like all pixels, and drawn by themselves: the error within their PSF."""
+    at, splatting = (side // 4, side // 3), KernelSplatting(quality="exact", bank=bank_of("combined"))
+    way = torch.tensor([6.0, -3.0]).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
+    for size, radius, name, change in (
+        (1, side / 20, "highlights in the direct domain", ("MOST", 0)),
+        (5, side / 5, "a mean without highlights to find them by", ("CLIPPED", 0)),
+    ):
+        coc, image = even(side, side, radius).float(), torch.ones(1, 1, side, side)
+        image[..., at[0] : at[0] + size, at[1] : at[1] + size] = 1e6 / 3
+        pixels, still = torch.arange(image.numel()), torch.zeros(image.numel(), 2)
+        source = torch.cat([image, torch.ones_like(image)], 1)
+        dense = splat_capsules(source, pixels, coc.flatten(), way[0].flatten(1).T.contiguous(), still)
+        want, errors = dense[:, :1] / dense[:, 1:], []
+        for setting in (change[1], getattr(bank_highlights, change[0])):
+            with mock.patch.object(bank_highlights, change[0], setting):
+                errors.append(float((splatting(image, coc, motion=way) - want).abs().max() / want.max()))
+        yield _row(name, f"error of a bokeh of {size} x {size} pixels of 3e5, of its maximum", *errors)
+    yield _region(side)
+
+
+def _region(side: int) -> Mechanism:
+    """A bright region like all else, and apart, with nothing beyond the support of its PSFs."""
+    image, coc = torch.ones(1, 3, side, side), even(side, side, 5.0).float()
+    image[..., : side // 2, : side // 2] = 1000.0
+    way = torch.tensor([5.0, -3.0]).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
+    splatting, leaks = KernelSplatting(quality="exact", bank=bank_of("combined")), []
+    for contrast in (math.inf, bank_highlights.CONTRAST):
+        with mock.patch.object(bank_highlights, "CONTRAST", contrast):
+            lit, dark = splatting(image, coc, motion=way), splatting(torch.ones_like(image), coc, motion=way)
+        leaks.append(float((lit - dark)[..., side // 2 + 12 :, :].abs().max()))
+    return _row("bright regions apart", "far-field leak of a region of 1000", *leaks)
 
 
 def _moments() -> Mechanism:
