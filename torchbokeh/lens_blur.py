@@ -41,20 +41,22 @@ MOST = 64
 class LensBlur(nn.Module):
     """Depth of field: every pixel spreads over its circle of confusion, near surfaces cover far ones.
 
-    A first look at the scene makes a `Plan` of what it needs; only that is done. A plain image is split into what
-    stands in front of the focus plane and the rest, whose hidden part is filled in or given by the caller. Input in
-    layers is taken as it is. Every surface is splatted (`torchbokeh.ops.splat.splat_spans`) and composed front to
-    back (`torchbokeh.layers.compose`), normalised by coverage: a constant image stays constant.
+    A first look at the scene makes a `Plan` of what it needs; only that is done, and what begins to be needed comes
+    gradually, so that no picture jumps as a scene changes. A plain image is split into what stands in front of the
+    focus plane and the rest, whose hidden part is filled in or given by the caller. Input in layers is taken as it is.
+    Every surface is splatted (`torchbokeh.ops.splat.splat_spans`) and composed front to back
+    (`torchbokeh.layers.compose`), normalised by coverage: a constant image stays constant.
 
-    A pixel that is NaN or infinite spoils its own channel of its own picture alone: the rows of its PSF, from there to
-    the right border; with motion, where something is filled in or where one convolution does it, all of it.
+    Half precision is computed in float32, and the result rounded. A pixel that is NaN or infinite spoils its own
+    channel of its own picture alone: the rows of its PSF, from there to the right border; with motion, where something
+    is filled in or where one convolution does it, all of it.
 
     Gradients reach all tensors that are passed, and the numbers of lens, dispersion and aperture. At a given plan they
     are the derivatives of what is painted, but for choices, which they take as made:
 
-    * the plan itself (which part is needed, where bins lie), which layers and pixels are not there, with an alpha of 0,
-      what counts as a highlight, and which sample of a bank stands for a motion. What is left out, a radius or a motion
-      below half a pixel and a radius that ``max_coc`` cuts get 0;
+    * the plan itself (which part is needed and how far, where bins lie), which layers and pixels are not there, with an
+      alpha of 0, what counts as a highlight, and which sample of a bank stands for a motion. What is left out, a radius
+      or a motion below half a pixel and a radius that ``max_coc`` cuts get 0;
     * where pixels are merged, their shares in two levels, and the rounding of radii to 1/64 of a cell, which is left
       out: the gradient is that of the smooth blur that merging approximates;
     * with ``shutter_depth``, radii come from there; ``depth`` then only says what is in front.
