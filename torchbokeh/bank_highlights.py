@@ -58,8 +58,7 @@ def dense_highlights(
         interpolate: see `torchbokeh.bank_splatting.splat_bank`.
 
     Returns:
-        What they spread, like ``values``, and all other values. Coverage stays with the others: a hole in it would be
-        seen through the ripples.
+        What they spread beyond what is ordinary, like ``values``, and all the rest, with the whole coverage.
     """
     count = bank.values.shape[1]
     with torch.no_grad():
@@ -72,10 +71,10 @@ def dense_highlights(
     if not len(pixels):
         return torch.zeros_like(values), values
     only = torch.zeros_like(excess).index_fill(0, pixels, 1.0).reshape(-1, 1, *values.shape[2:]) > 0
-    rest = torch.cat([values[:, :-count].masked_fill(only, 0.0), values[:, -count:]], 1)
-    lit = [(light_of(one, count), part) for one, part in lit]
+    kept = share_of_others(light, ordinary, only, count)
+    rest, lit = values * kept, [(one * (1 - kept), part) for one, part in lit]
     if not isinstance(bank.model, Combined):
-        return splat_samples([(one * only, part) for one, part in lit], bank, 1, interpolate, dense=True), rest
+        return splat_samples(lit, bank, 1, interpolate, dense=True), rest
 
     def of(t: Tensor) -> Tensor:
         return t.movedim(1, -1).flatten(0, 2)[pixels]
@@ -86,6 +85,17 @@ def dense_highlights(
         centre = torch.zeros_like(way) if part.offset is None else of(part.offset)
         dense = dense + splat_capsules(one, pixels, of(needed(part))[:, 0].abs(), way, centre)
     return dense, rest
+
+
+@torch.no_grad()
+def share_of_others(light: Tensor, ordinary: Tensor, highlights: Tensor, count: int) -> Tensor:
+    """Which share of each value is spread with all others: of highlights, what any pixel there would show.
+
+    Without it, and without their coverage, the last ``count`` channels, there would be a hole, and ripples around it.
+    """
+    share = (ordinary / light.abs().clamp_min(TINY)).clamp(max=1.0)
+    share = torch.cat([share[:, :-count], torch.ones_like(share[:, -count:])], 1)
+    return torch.where(highlights, share, 1.0)
 
 
 def light_of(values: Tensor, count: int) -> Tensor:

@@ -29,6 +29,7 @@ SMALL = """
 import sys
 from functools import partial
 sys.argv[0] = "torchbokeh"
+from torchbokeh.cli import main
 from torchbokeh.psfs import SimpleLens
 from torchbokeh.psfs.models import MODELS
 MODELS["simple-lens"] = partial(SimpleLens, radius=3.0)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchbokeh.bank_highlights import BRIGHT, _area, light_of, usual
+from torchbokeh.bank_highlights import BRIGHT, _area, share_of_others, usual
 from torchbokeh.bank_splatting import _confined, _far_beyond
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
@@ -48,12 +48,14 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
     values = values / len(parts)
     seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
     light = torch.stack([t for t, _ in seen]).mean(0)
-    bound = usual(light) * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+    ordinary = usual(light)
+    bound = ordinary * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
     bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
+    kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
     out = torch.zeros_like(values)
     for own, part in seen:
-        lit = light_of(own, bank.values.shape[1]) * bright
-        rest = own - lit
+        rest = own * kept
+        lit = own - rest
         still = None if part.coc is None else bank.model.still(part)
         if still is not None and part.coc is not None:
             resting, rest = rest * still, rest * (1 - still)
