@@ -20,8 +20,8 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 import torchbokeh as tb
-from torchbokeh.demo import motorcycle
-from torchbokeh.image_io import replacing, write_image
+from torchbokeh.commands.demo import motorcycle
+from torchbokeh.io.pictures import replacing, write_image
 
 PLANES = (1.0, 0.1)  # where the two photographs of a scene are in focus, in dioptres: at 1 m and at 10 m
 BLUR = 7.0  # px: CoC radius of the one plane where the lens is focused on the other

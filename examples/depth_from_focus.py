@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from tqdm import trange
 
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 from torchbokeh.ops.convolve import blur_uniform
 from torchbokeh.psfs import Disc
 

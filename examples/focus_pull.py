@@ -8,8 +8,8 @@ from PIL import Image
 from tqdm import tqdm
 
 import torchbokeh as tb
-from torchbokeh.demo import motorcycle, motorcycle_lens
-from torchbokeh.image_io import encode_srgb, replacing
+from torchbokeh.commands.demo import motorcycle, motorcycle_lens
+from torchbokeh.io.pictures import encode_srgb, replacing
 
 NEAR, FAR = 2.1, 4.8  # metres: the turn signal, the wall
 

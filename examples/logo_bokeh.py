@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 from torchbokeh.psfs.build import build
 from torchbokeh.psfs.stylized import Stylized
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 from torchbokeh.report.measure import errors
 
 

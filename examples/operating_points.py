@@ -7,9 +7,9 @@ from pathlib import Path
 import torch
 
 import torchbokeh as tb
-from torchbokeh.demo import motorcycle, motorcycle_lens
-from torchbokeh.image_io import write_image
-from torchbokeh.quality import QUALITIES
+from torchbokeh.commands.demo import motorcycle, motorcycle_lens
+from torchbokeh.io.pictures import write_image
+from torchbokeh.plan.quality import QUALITIES
 
 FOCUS = 2.1  # metres: the turn signal
 

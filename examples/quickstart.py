@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 import torchbokeh as tb
-from torchbokeh.demo import motorcycle
-from torchbokeh.image_io import write_image
+from torchbokeh.commands.demo import motorcycle
+from torchbokeh.io.pictures import write_image
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--out", type=Path, default=Path("out/quickstart.png"))

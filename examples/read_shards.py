@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import torchbokeh as tb
+from torchbokeh.datasets.shards import read_shards, write_shards
 from torchbokeh.scenes import ProceduralDataset
-from torchbokeh.scenes.shards import read_shards, write_shards
 
 
 def psnr(picture: Tensor, truth: Tensor) -> float:

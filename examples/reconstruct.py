@@ -6,10 +6,10 @@ from pathlib import Path
 import torch
 
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
-from torchbokeh.reconstruction import reconstruct
-from torchbokeh.report.experiments_motion import non_local_means
+from torchbokeh.io.pictures import write_image
+from torchbokeh.renderers.reconstruction import reconstruct
 from torchbokeh.report.measure import errors
+from torchbokeh.report.motion.experiments import non_local_means
 from torchbokeh.scenes import samples
 
 

@@ -16,8 +16,8 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 import torchbokeh as tb
+from torchbokeh.datasets.shards import read_shards, write_shards
 from torchbokeh.scenes import ProceduralDataset
-from torchbokeh.scenes.shards import read_shards, write_shards
 
 
 class Blur(nn.Module):

@@ -14,8 +14,8 @@ from safetensors.torch import save_file
 from tqdm import tqdm
 
 import torchbokeh as tb
-from torchbokeh.image_io import replacing
-from torchbokeh.training import KINDS, LEVELS, SIZES, fit_integrator, laplacian_pictures, relative_errors
+from torchbokeh.io.pictures import replacing
+from torchbokeh.learn.training import KINDS, LEVELS, SIZES, fit_integrator, laplacian_pictures, relative_errors
 
 
 def main() -> None:

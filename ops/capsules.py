@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchbokeh.ops._checks import check_image
-from torchbokeh.ops._dispatch import has_kernel
+from torchbokeh.ops.checks import check_image
+from torchbokeh.ops.dispatch import has_kernel
 from torchbokeh.ops.spans import MIN_RADIUS
 
 FINE = 2
@@ -57,7 +57,7 @@ class _Capsules(torch.autograd.Function):
     @staticmethod
     def forward(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
         if has_kernel(values):
-            from torchbokeh.ops import _capsule_kernels
+            from torchbokeh.ops.kernels import capsules as _capsule_kernels
 
             return _capsule_kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
         return _splat_capsules_torch(values, pixels, radius, motion, centre)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_image, check_number
-from torchbokeh.ops._dispatch import only_definitions
+from torchbokeh.ops.checks import check_image, check_number
+from torchbokeh.ops.dispatch import only_definitions
 
 TINY = 1e-12
 """Coverage below this counts as none; far below what one pixel of a PSF of radius 1e5 covers."""

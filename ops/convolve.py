@@ -6,7 +6,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.checks import check_image
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.spans import Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans

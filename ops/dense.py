@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_kind, check_whole
+from torchbokeh.ops.checks import check_image, check_kind, check_whole
 from torchbokeh.ops.points import PointTable
 from torchbokeh.ops.spans import Profile, check_profile, clamp_radius, row_span
 

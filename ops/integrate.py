@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import MOST_PIXELS, check_flag, check_image, check_pixels, check_whole
+from torchbokeh.ops.checks import MOST_PIXELS, check_flag, check_image, check_pixels, check_whole
 
 _SHAPE = ("B", "C", "H", "W")
 _NEAR = 128  # offsets below this take the integral of the Green's function, the others its expansion

@@ -29,9 +29,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_flag, check_image, check_kind, check_whole
-from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
@@ -286,7 +286,7 @@ def _splat_merged_op(
     ones: bool,
     normalise: bool,
 ) -> Tensor:
-    from torchbokeh.ops import _merge_kernels
+    from torchbokeh.ops.kernels import merge as _merge_kernels
 
     merging = Merging(cells, highlight)
     return _merge_kernels.splat_merged(values, coc, weight, Profile(knots, bulge), merging, highest, ones, normalise)
@@ -323,7 +323,7 @@ def _gather_merged_op(
     highest: int,
     ones: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    from torchbokeh.ops import _merge_gather
+    from torchbokeh.ops.kernels import merge_gather as _merge_gather
 
     merging = Merging(cells, highlight)
     return _merge_gather.gather_merged(grad, out, values, coc, weight, Profile(knots, bulge), merging, highest, ones)

@@ -12,7 +12,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_whole
+from torchbokeh.ops.checks import check_image, check_whole
 
 
 @dataclass(frozen=True, eq=False)

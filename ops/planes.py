@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import check_flag, check_image, check_kind, check_size, check_whole
-from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_size, check_whole
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
 SOLID = 1e-6
@@ -140,7 +140,7 @@ def render_planes(
     leaves = (inverse, *(texture for pyramid in plates.levels for texture in pyramid))
     grads = torch.is_grad_enabled() and any(t.requires_grad for t in leaves)
     if count and has_kernel(texels) and not grads:
-        from torchbokeh.ops import _plane_kernels
+        from torchbokeh.ops.kernels import planes as _plane_kernels
 
         return _plane_kernels.render_planes(plates, inverse, level, size, parents, frames)
     return _render_planes_torch(plates, inverse, level, size, parents, frames)

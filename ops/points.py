@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_kind, check_pixels, check_size
-from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.checks import check_image, check_kind, check_pixels, check_size
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.spans import working_dtype
 
 CHUNK = 1 << 20
@@ -297,7 +297,7 @@ def _splat_points_op(
     _check_contents(index, offsets, counts)
     points = _packed(offsets, weights)
     if has_kernel(values):
-        from torchbokeh.ops import _point_kernels
+        from torchbokeh.ops.kernels import points as _point_kernels
 
         return _point_kernels.splat_points(values, index, points, counts, rotation, position, pad, size)
     return _splat_points_torch(values, index, points, counts, rotation, position, pad, size)
@@ -334,7 +334,7 @@ def _gather_points_op(
 ) -> list[Tensor]:
     points = _packed(offsets, weights)
     if has_kernel(values) and not geometry:
-        from torchbokeh.ops import _point_kernels
+        from torchbokeh.ops.kernels import points as _point_kernels
 
         return [_point_kernels.gather_points(grad, index, points, counts, rotation, position, pad)]
     return _gather_points_torch(grad, values, index, points, counts, rotation, position, pad, size, geometry)

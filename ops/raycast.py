@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_number, check_whole
-from torchbokeh.ops._dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.checks import check_image, check_number, check_whole
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.nbuffers import NBuffers
 from torchbokeh.ops.spans import working_dtype
 
@@ -94,7 +94,7 @@ def subsample_blur(
     missed = colour if background is None else background
     grads = torch.is_grad_enabled() and (colour.requires_grad or missed.requires_grad)
     if has_kernel(colour) and coc.dtype == missed.dtype == torch.float32 and not grads:
-        from torchbokeh.ops import _raycast_kernels
+        from torchbokeh.ops.kernels import raycast as _raycast_kernels
 
         return _raycast_kernels.subsample_blur(colour, coc, views, far, background, iterations, tolerance)
     dtype = compute_dtype(colour)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_whole
+from torchbokeh.ops.checks import check_image, check_whole
 from torchbokeh.ops.spans import Profile, check_profile, edges_at
 
 MOST = 1 << 24

@@ -7,7 +7,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_kind
+from torchbokeh.ops.checks import check_kind
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 310.0, 2300.0

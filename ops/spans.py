@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_kind, check_whole
+from torchbokeh.ops.checks import check_image, check_kind, check_whole
 
 MIN_RADIUS = 0.5
 """Below this radius (px) a PSF lies within its own pixel: the splat is the identity."""

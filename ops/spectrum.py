@@ -10,8 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchbokeh.ops import _cie_1931
-from torchbokeh.ops._checks import check_flag, check_image
+from torchbokeh.ops import cie_1931 as _cie_1931
+from torchbokeh.ops.checks import check_flag, check_image
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 380.0, 780.0

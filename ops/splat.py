@@ -15,10 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_flag, check_image
-from torchbokeh.ops._dispatch import compute_dtype, has_kernel
-from torchbokeh.ops._span_gradient import row_span_gradient
+from torchbokeh.ops.checks import check_flag, check_image
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel
 from torchbokeh.ops.points import PointTable, splat_points
+from torchbokeh.ops.span_gradient import row_span_gradient
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, row_span, working_dtype
 
 __all__ = ["PointTable", "splat_points", "splat_spans"]
@@ -154,7 +154,7 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
 def _splat_spans_op(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
     profile = Profile(knots, bulge)
     if has_kernel(values):
-        from torchbokeh.ops import _span_kernels
+        from torchbokeh.ops.kernels import splat as _span_kernels
 
         return _span_kernels.splat_spans(values, coc, profile, integrate)
     return _splat_spans_torch(values, coc, profile, integrate)
@@ -171,7 +171,7 @@ def _gather_spans_op(
 ) -> list[Tensor]:
     profile = Profile(knots, bulge)
     if has_kernel(values) and not shape:
-        from torchbokeh.ops import _span_kernels
+        from torchbokeh.ops.kernels import splat as _span_kernels
 
         grads = _span_kernels.gather_spans(grad, values, coc, profile)
         return [*grads, torch.zeros_like(knots), torch.zeros_like(bulge)]

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image, check_kind, check_whole
-from torchbokeh.ops._dispatch import has_kernel
+from torchbokeh.ops.checks import check_image, check_kind, check_whole
 from torchbokeh.ops.composite import bin_weights, check_centres, fill_until_full
+from torchbokeh.ops.dispatch import has_kernel
 from torchbokeh.ops.merge import MOST_LEVELS, Merging, splat_merged
 from torchbokeh.ops.spans import Profile, check_profile
 
@@ -77,7 +77,7 @@ def _blur_surface_op(
     highlight: float,
     highest: int,
 ) -> list[Tensor]:
-    from torchbokeh.ops import _surface_kernels
+    from torchbokeh.ops.kernels import surface as _surface_kernels
 
     merging = Merging(cells, highlight)
     return [*_surface_kernels.blur_surface(colour, coc, weights, Profile(knots, bulge), merging, highest)]

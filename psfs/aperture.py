@@ -10,7 +10,7 @@ import re
 import torch
 from torch import Tensor, nn
 
-from torchbokeh.ops._checks import check_image, check_number
+from torchbokeh.ops.checks import check_image, check_number
 from torchbokeh.ops.spans import Profile
 
 CHORDS = 16

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchbokeh.ops._files import replacing
 from torchbokeh.ops.points import PointTable
+from torchbokeh.ops.system.files import replacing
 from torchbokeh.psfs.model import FRAME, PsfModel
 from torchbokeh.psfs.models import MODELS, model_from
 from torchbokeh.psfs.refit import Sparse, drawn, reconstruction

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from torchbokeh.ops._files import replacing
-from torchbokeh.ops._processes import end_with_parent, ending_children, starting_children
+from torchbokeh.ops.system.files import replacing
+from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.model import PsfModel
 from torchbokeh.psfs.refit import Sparse, reconstruction

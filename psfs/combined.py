@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_number
+from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, gaussian, mean_picture, scaled, turned
 

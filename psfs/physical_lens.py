@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchbokeh.ops._checks import check_number
+from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.sellmeier import refractive_index
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
 from torchbokeh.psfs.tracing import cropped, splat_rays, spread

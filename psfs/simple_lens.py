@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchbokeh.ops._checks import check_number
+from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.combined import capsule, of_radius
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel

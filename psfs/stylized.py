@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchbokeh.ops._checks import check_number
+from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.model import Axis
 from torchbokeh.psfs.simple_lens import RadiusModel

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchbokeh.ops._checks import check_number
+from torchbokeh.ops.checks import check_number
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 from torchbokeh.psfs.tracing import cropped
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh.augmentation import RandomLensBlur
+from torchbokeh.learn.augmentation import RandomLensBlur
 
 QUALITIES = ("exact", "high", "balanced", "fast")
 

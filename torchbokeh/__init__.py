@@ -5,8 +5,8 @@ An image and its depth go in, the picture a lens would take comes out. `LensBlur
 
 from importlib.util import find_spec as _find_spec
 
-from torchbokeh._signals import end_while_importing as _end_while_importing
-from torchbokeh._signals import is_command as _is_command
+from torchbokeh.commands.signals import end_while_importing as _end_while_importing
+from torchbokeh.commands.signals import is_command as _is_command
 
 if _is_command():
     _end_while_importing()
@@ -17,18 +17,18 @@ if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None
     )
 
 from torchbokeh import scenes
-from torchbokeh.accumulation import AccumulationBuffer
-from torchbokeh.chromatic import ChromaticAccumulation
-from torchbokeh.dispersion import Dispersion
-from torchbokeh.export import export_onnx
-from torchbokeh.field_map import FieldMap
-from torchbokeh.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
-from torchbokeh.kernel_splatting import KernelSplatting, SplattingPlan
+from torchbokeh.learn.export import export_onnx
+from torchbokeh.learn.integration import FFTIntegrator, PyramidIntegrator, ScanlineIntegrator
 from torchbokeh.lens import DisparityLens, Lens, ThinLens
-from torchbokeh.lens_blur import LensBlur
-from torchbokeh.plan import Plan
+from torchbokeh.lens.dispersion import Dispersion
+from torchbokeh.lens.field_map import FieldMap
+from torchbokeh.plan.plan import Plan
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon, PsfBank
-from torchbokeh.reconstruction import Samples, pinhole_position, reconstruct
+from torchbokeh.renderers.accumulation import AccumulationBuffer
+from torchbokeh.renderers.chromatic import ChromaticAccumulation
+from torchbokeh.renderers.kernel_splatting import KernelSplatting, SplattingPlan
+from torchbokeh.renderers.lens_blur import LensBlur
+from torchbokeh.renderers.reconstruction import Samples, pinhole_position, reconstruct
 
 __version__ = "0.1.0"
 

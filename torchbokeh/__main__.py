@@ -2,7 +2,7 @@
 
 import sys
 
-from torchbokeh.cli import main
+from torchbokeh.commands.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

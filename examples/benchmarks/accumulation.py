@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from torchbokeh import AccumulationBuffer
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 from torchbokeh.scenes import RECIPES, Camera, ProceduralDataset, Scene
 
 SCENES = ("stack", "fence", "whirl")

@@ -28,7 +28,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 
 FLOOR, WALL = 0.6, 9.0  # metres below and behind the camera
 SUBJECT = (2.6, -0.15, 0.15, 0.62)  # depth, x, y, radius

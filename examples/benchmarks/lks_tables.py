@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchbokeh.report.experiments_motion import like_lks
+from torchbokeh.report.motion.experiments import like_lks
 from torchbokeh.report.settings import Settings
 from torchbokeh.report.sheets import write_sheet
 from torchbokeh.report.tables import like_lks_table

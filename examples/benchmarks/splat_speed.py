@@ -24,7 +24,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from torchbokeh import KernelSplatting
-from torchbokeh.report.scatter import dense_scatter
+from torchbokeh.report.speed.scatter import dense_scatter
 
 
 def scene(size: int, radius: float) -> tuple[Tensor, Tensor]:

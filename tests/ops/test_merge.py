@@ -15,7 +15,7 @@ from torch.func import functional_call
 from torch.nn import functional as F
 
 import torchbokeh.ops.merge
-from torchbokeh.ops import _dispatch
+from torchbokeh.ops import dispatch as _dispatch
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import (
     FADE,

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh.ops.planes
-from torchbokeh.ops import _dispatch, _plane_kernels
+from torchbokeh.ops import dispatch as _dispatch
+from torchbokeh.ops.kernels import planes as _plane_kernels
 from torchbokeh.ops.planes import Plates, _render_planes_torch, render_planes
 
 F32, F64 = torch.float32, torch.float64

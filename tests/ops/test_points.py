@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh.ops.points
-from torchbokeh.ops import _dispatch
+from torchbokeh.ops import dispatch as _dispatch
 from torchbokeh.ops.dense import dense_points
 from torchbokeh.ops.points import PointTable, splat_points
 

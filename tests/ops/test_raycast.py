@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import torchbokeh.ops.raycast
-from torchbokeh.ops import _dispatch
+from torchbokeh.ops import dispatch as _dispatch
 from torchbokeh.ops.raycast import coc_bounds, subsample_blur
 
 F32, F64 = torch.float32, torch.float64

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchbokeh.ops._span_gradient import row_span_gradient
+from torchbokeh.ops.span_gradient import row_span_gradient
 from torchbokeh.ops.spans import Profile, row_span
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh.ops.spectrum
-from torchbokeh.ops._cie_1931 import FIRST, LAST, MATCHING, STEP
+from torchbokeh.ops.cie_1931 import FIRST, LAST, MATCHING, STEP
 from torchbokeh.ops.sampling import halton
 from torchbokeh.ops.spectrum import HIGH, LOW, Formula, Weight, linear_rgb, spectral_bands, spectral_samples, xyz
 

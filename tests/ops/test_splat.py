@@ -12,7 +12,7 @@ from torch.func import functional_call
 from torch.utils.data import DataLoader, Dataset
 
 import torchbokeh.ops.splat
-from torchbokeh.ops import _dispatch
+from torchbokeh.ops import dispatch as _dispatch
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import Merging, splat_merged

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchbokeh as tb
 from torchbokeh import psfs
-from torchbokeh.augmentation import RandomLensBlur, plausible_lenses
+from torchbokeh.learn.augmentation import RandomLensBlur, plausible_lenses
 
 ANY = st.floats() | st.sampled_from([0.0, -0.0, 5e-324, 1e-45, 1e-38, 1e38, 3.5e38, 1e308, 0.05, 2.0])
 DEPTH = torch.tensor([1e-3, 0.05, 1.0, 2.0, 1e4, torch.inf]).view(1, 1, 1, 6)

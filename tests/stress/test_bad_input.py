@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh import augmentation, psfs, scenes
+from torchbokeh import psfs, scenes
+from torchbokeh.learn import augmentation
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented
 

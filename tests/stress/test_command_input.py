@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchbokeh.cli import main
-from torchbokeh.image_io import write_image
+from torchbokeh.commands.main import main
+from torchbokeh.io.pictures import write_image
 
 H, W = 12, 16
 

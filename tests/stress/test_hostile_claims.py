@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchbokeh.flow_io import MAGIC, read_flow
-from torchbokeh.image_io import read_image, read_map
+from torchbokeh.datasets.shards import shard_indices
+from torchbokeh.io.flow import MAGIC, read_flow
+from torchbokeh.io.pictures import read_image, read_map
 from torchbokeh.psfs import PsfBank, SimpleLens
 from torchbokeh.psfs.bank import FARTHEST
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented
 from torchbokeh.scenes import read_shards, write_shards
-from torchbokeh.scenes.shards import shard_indices
 
 
 class Bomb:

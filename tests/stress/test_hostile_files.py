@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchbokeh.flow_io import MAGIC, read_flow
-from torchbokeh.image_io import read_image, read_map
+from torchbokeh.io.flow import MAGIC, read_flow
+from torchbokeh.io.pictures import read_image, read_map
 from torchbokeh.psfs import PsfBank, SimpleLens
 from torchbokeh.psfs.bank import _DTYPES, _digest
 from torchbokeh.psfs.refit import Sparse

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchbokeh._signals import Terminated, stoppable
-from torchbokeh.image_io import read_image, write_image
-from torchbokeh.ops._threads import run_all
+from torchbokeh.commands.signals import Terminated, stoppable
+from torchbokeh.io.pictures import read_image, write_image
+from torchbokeh.ops.system.threads import run_all
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, limits and /proc as Linux has them")
 
@@ -29,7 +29,7 @@ SMALL = """
 import sys
 from functools import partial
 sys.argv[0] = "torchbokeh"
-from torchbokeh.cli import main
+from torchbokeh.commands.main import main
 from torchbokeh.psfs import SimpleLens
 from torchbokeh.psfs.models import MODELS
 MODELS["simple-lens"] = partial(SimpleLens, radius=3.0)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import torchbokeh as tb
-from torchbokeh.ops._threads import run_all
+from torchbokeh.ops.system.threads import run_all
 from torchbokeh.scenes import ProceduralDataset
 
 THREADS = 16

@@ -6,17 +6,16 @@ import math
 import pytest
 import torch
 
-from torchbokeh.report import stability_checks as checks
-from torchbokeh.report.stability import QUICK, render_rows, rows_of
-from torchbokeh.report.stability_bounds import PRECISIONS
-from torchbokeh.report.stability_cases import Case, beyond, cases, even
-from torchbokeh.report.stability_mechanisms import mechanism_rows
-from torchbokeh.report.stability_options import options
-from torchbokeh.report.stability_renderer import Renderer
-from torchbokeh.report.stability_renderers import renderers
-from torchbokeh.report.stability_rows import row
-from torchbokeh.report.stability_scenes import scene_rows
-from torchbokeh.report.stability_sweeps import plan_rows, sweep_rows
+from torchbokeh.report.stability.bounds import PRECISIONS
+from torchbokeh.report.stability.cases import Case, beyond, cases, even
+from torchbokeh.report.stability.mechanisms import mechanism_rows
+from torchbokeh.report.stability.options import options
+from torchbokeh.report.stability.renderer import Renderer
+from torchbokeh.report.stability.renderers import renderers
+from torchbokeh.report.stability.rows import row
+from torchbokeh.report.stability.run import QUICK, checks, render_rows, rows_of
+from torchbokeh.report.stability.scenes import scene_rows
+from torchbokeh.report.stability.sweeps import plan_rows, sweep_rows
 
 NAMES, OPTIONS = [r.name for r in renderers()], list(options())
 PLAIN = [name for name in NAMES if name not in [r.name for r in OPTIONS]]
@@ -154,8 +153,8 @@ def test_every_mechanism_is_of_use() -> None:
 @pytest.mark.slow
 def test_the_chapter_is_written_whole(tmp_path) -> None:
     pytest.importorskip("matplotlib")
-    from torchbokeh.report.stability import run_stability
-    from torchbokeh.report.stability_write import write_stability
+    from torchbokeh.report.stability.run import run_stability
+    from torchbokeh.report.stability.write import write_stability
 
     said: list[str] = []
     found = run_stability(QUICK, said.append)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from torchbokeh.cli import main
+from torchbokeh.commands.main import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and limits as Linux has them")
 
@@ -23,10 +23,10 @@ import matplotlib; matplotlib.use("agg")
 import torch
 from matplotlib.figure import Figure
 import torchbokeh as tb
-from torchbokeh.image_io import write_image
+from torchbokeh.io.pictures import write_image
 from torchbokeh.report.sheets import write_sheet
 from torchbokeh.report.write import write_together
-from torchbokeh.scenes.shards import write_shards
+from torchbokeh.datasets.shards import write_shards
 
 image, bank = torch.rand(1, 3, 40, 50), tb.PsfBank.load("combined")
 dataset = tb.scenes.ProceduralDataset(resolution=(16, 24), length=2, views=4)
@@ -80,9 +80,9 @@ WRITING = {
     "report --stability": (
         "stability",
         "torchbokeh.report.stability.run_stability",
-        "torchbokeh.report.stability_write.{}",
+        "torchbokeh.report.stability.write.{}",
     ),
-    "psfs analyse": ("psfs", "torchbokeh.psf_analysis.analyse", "torchbokeh.psf_{}"),
+    "psfs analyse": ("psfs", "torchbokeh.report.psfs.analysis.analyse", "torchbokeh.psf_{}"),
 }
 
 

@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> None:
 def _stability(args: argparse.Namespace) -> None:
     import torch
 
-    from torchbokeh.report.stability import QUICK, StabilitySettings, run_stability
-    from torchbokeh.report.stability_write import write_stability
+    from torchbokeh.report.stability.run import QUICK, StabilitySettings, run_stability
+    from torchbokeh.report.stability.write import write_stability
     from torchbokeh.report.write import prepare
 
     if args.scenes or args.only:

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from matplotlib.transforms import Bbox
 
-from torchbokeh.report.methods import OWN
+from torchbokeh.report.speed.methods import OWN
 
 Row = dict[str, Any]
 

@@ -4,8 +4,14 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from torchbokeh.report.baselines import absent
-from torchbokeh.report.experiments import (
+from torchbokeh.report.chromatic.experiments import chromatic_bands, chromatic_samples, chromatic_truth, importance
+from torchbokeh.report.machine import machine
+from torchbokeh.report.measure import flip_is_there
+from torchbokeh.report.motion.experiments import like_lks, with_motion
+from torchbokeh.report.settings import Settings
+from torchbokeh.report.speed.baselines import absent
+from torchbokeh.report.speed.blur import against_layers, against_truth, left_out
+from torchbokeh.report.speed.experiments import (
     Say,
     against_pixels,
     against_radius,
@@ -13,16 +19,10 @@ from torchbokeh.report.experiments import (
     methods,
     one_layer,
 )
-from torchbokeh.report.experiments_blur import against_layers, against_truth, left_out
-from torchbokeh.report.experiments_chromatic import chromatic_bands, chromatic_samples, chromatic_truth, importance
-from torchbokeh.report.experiments_motion import like_lks, with_motion
-from torchbokeh.report.experiments_stages import stages
-from torchbokeh.report.exported import can_export, exported
-from torchbokeh.report.gradients import gradient_methods, gradients
-from torchbokeh.report.machine import machine
-from torchbokeh.report.measure import flip_is_there
-from torchbokeh.report.memory import is_known
-from torchbokeh.report.settings import Settings
+from torchbokeh.report.speed.exported import can_export, exported
+from torchbokeh.report.speed.gradients import gradient_methods, gradients
+from torchbokeh.report.speed.memory import is_known
+from torchbokeh.report.speed.stages import stages
 
 FORMAT = 1
 """Of ``report.json``; it goes up when the meaning of a field changes."""

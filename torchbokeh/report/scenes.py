@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.accumulation import AccumulationBuffer
+from torchbokeh.renderers.accumulation import AccumulationBuffer
 from torchbokeh.scenes import RECIPES
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchbokeh.image_io import check_writable, encode_srgb, replacing
+from torchbokeh.io.pictures import check_writable, encode_srgb, replacing
 
 
 def write_sheet(path: Path, pictures: Sequence[tuple[str, Tensor]], columns: int = 4) -> None:

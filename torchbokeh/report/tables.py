@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from torchbokeh.report.exported import export_section
-from torchbokeh.report.gradients import gradient_section
+from torchbokeh.report.chromatic.tables import chromatic_sections
 from torchbokeh.report.markdown import Row, number, pictures, seconds, section, skipped, spread, table
-from torchbokeh.report.tables_chromatic import chromatic_sections
+from torchbokeh.report.speed.exported import export_section
+from torchbokeh.report.speed.gradients import gradient_section
 
 
 def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
@@ -245,7 +245,7 @@ def _motion(rows: list[Row]) -> str:
 
 
 def like_lks_table(rows: list[Row]) -> str:
-    """The rows of `torchbokeh.report.experiments_motion.like_lks` as a Markdown table."""
+    """The rows of `torchbokeh.report.motion.experiments.like_lks` as a Markdown table."""
     head = ["scene", "kind", "method", "seconds", "times dense", "SSIM", "PSNR", "L1"]
     cells = [
         [row["scene"], row["kind"], row["method"], seconds(row["seconds"]), number(row["times_dense"], ".1f")]

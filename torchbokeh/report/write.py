@@ -6,8 +6,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from torchbokeh.image_io import check_writable
-from torchbokeh.ops._files import replacing_together
+from torchbokeh.io.pictures import check_writable
+from torchbokeh.ops.system.files import replacing_together
 from torchbokeh.report.plots import draw
 from torchbokeh.report.tables import markdown
 

@@ -5,7 +5,7 @@ from numbers import Integral
 
 import numpy as np
 
-from torchbokeh.ops._checks import check_size as check_size
+from torchbokeh.ops.checks import check_size as check_size
 
 
 def rng(seed: int, *keys: int | str) -> np.random.Generator:

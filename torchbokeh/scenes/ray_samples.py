@@ -4,12 +4,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops._checks import MOST_PIXELS, check_whole
+from torchbokeh.ops.checks import MOST_PIXELS, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.planes import Plates, pixel_centres
 from torchbokeh.ops.sampling import aperture_points
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.reconstruction import Samples
+from torchbokeh.renderers.reconstruction import Samples
 from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3
@@ -18,7 +18,7 @@ CHUNK = 1 << 18
 """Rays times cards that are looked at together."""
 
 MOST = 1 << 16
-"""Most rays of a pixel; of a picture, no more than `torchbokeh.ops._checks.MOST_PIXELS`."""
+"""Most rays of a pixel; of a picture, no more than `torchbokeh.ops.checks.MOST_PIXELS`."""
 
 
 def samples(scene: Scene, camera: Camera, per_pixel: int = 1, seed: int = 0) -> Samples:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.lens import ThinLens
-from torchbokeh.ops._checks import check_whole
+from torchbokeh.ops.checks import check_whole
 from torchbokeh.scenes import shapes, textures
 from torchbokeh.scenes._random import check_size, rng
 from torchbokeh.scenes.camera import Camera

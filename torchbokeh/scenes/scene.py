@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_whole
-from torchbokeh.ops._dispatch import compute_dtype
+from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.planes import Plates, pixel_centres, render_planes
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.layering import Fragments, stack_layers

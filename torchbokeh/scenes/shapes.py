@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.checks import check_image
 from torchbokeh.scenes._random import check_size, count_setting, rng, setting
 from torchbokeh.scenes._raster import fill
 

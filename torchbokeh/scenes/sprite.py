@@ -8,7 +8,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from torchbokeh.ops._checks import check_image
+from torchbokeh.ops.checks import check_image
 
 Vector = tuple[float, float, float]
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from torchbokeh.report import experiments, gradients
 from torchbokeh.report.run import run_experiments
 from torchbokeh.report.settings import Settings
+from torchbokeh.report.speed import experiments, gradients
 
 TINY = Settings(
     scenes=("photo", "coins"),

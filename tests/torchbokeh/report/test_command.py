@@ -6,11 +6,12 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from torchbokeh.report import command, experiments, gradients
+from torchbokeh.report import command
 from torchbokeh.report import run as run_module
 from torchbokeh.report import settings as settings_module
 from torchbokeh.report.command import add_report
-from torchbokeh.report.stability import QUICK, StabilitySettings
+from torchbokeh.report.speed import experiments, gradients
+from torchbokeh.report.stability.run import QUICK, StabilitySettings
 
 
 def run(*flags):
@@ -78,7 +79,7 @@ def test_bad_input_is_named(flags, message, tmp_path, monkeypatch):
 def test_stability_is_a_chapter_of_its_own(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("torchbokeh.report.stability.run_stability", lambda settings, say: asked.append(settings))
-    monkeypatch.setattr("torchbokeh.report.stability_write.write_stability", lambda found, folder: [folder / "a.md"])
+    monkeypatch.setattr("torchbokeh.report.stability.write.write_stability", lambda found, folder: [folder / "a.md"])
     run("--stability", "--out", str(tmp_path))
     run("--stability", "--quick", "--out", str(tmp_path))
     assert asked == [StabilitySettings(), QUICK]

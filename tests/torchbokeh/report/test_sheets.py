@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchbokeh.image_io import encode_srgb
+from torchbokeh.io.pictures import encode_srgb
 from torchbokeh.report.sheets import write_sheet
 
 

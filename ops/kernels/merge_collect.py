@@ -1,0 +1,251 @@
+"""The first pass of `splat_merged` for CPU float32: which level a pixel belongs to, and the sums of all cells."""
+
+from functools import partial
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.merge import FADE, LEAST_CONTRAST, Merging
+from torchbokeh.ops.system.threads import run_all
+
+BAND = 64
+"""Rows of a piece of work: 64 rows of 1024 columns in double fill the second-level cache of common processors."""
+
+RECORD = 8
+"""Floats of a cell: four channels, then the sums of share, of share times radius and of share times signed CoC."""
+
+
+class Lanes(NamedTuple):
+    """Which channels a pass of four takes: their numbers, and where there is none, the constant in its place."""
+
+    channel: np.ndarray
+    constant: np.ndarray
+
+    @classmethod
+    def of(cls, group: int, channels: int, ones: bool) -> "Lanes":
+        """The lanes of a group of four of ``channels`` channels, and one more of ones."""
+        wanted = np.arange(4 * group, 4 * group + 4)
+        constant = ((wanted == channels) & ones).astype(np.float32)
+        return cls(np.where(wanted < channels, wanted, -1), constant)
+
+
+class Levels(NamedTuple):
+    """What stands where.
+
+    Attributes:
+        sizes: ``(L+1, 3)``: rows and columns of each level, and the number of its first cell.
+        cells: flat records of all cells, see `RECORD`.
+        reach: ``(L+1, H)`` largest radius in px in each row of a level; on the lowest, of what is no highlight.
+        marks: flat indices of the highlights.
+        bounds: ``(C,)`` mean of each channel, against which highlights are bright.
+    """
+
+    sizes: np.ndarray
+    cells: np.ndarray
+    reach: np.ndarray
+    marks: np.ndarray
+    bounds: np.ndarray
+
+
+@nb.njit(cache=True, nogil=True, fastmath=True)
+def _largest(row):  # type: ignore[no-untyped-def]
+    top = np.float32(0.0)
+    for x in range(len(row)):
+        top = max(top, abs(row[x]))
+    return top
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def classify(values, coc, weight, y, merging, bounds, highest, level, share):  # type: ignore[no-untyped-def]
+    """Level of every pixel of row ``y`` and its share there; the rest belongs to the level below.
+
+    -1 stands for a highlight, -2 for a pixel without weight. ``level`` and ``share`` are float32 rows, so that the
+    compiler can work on many pixels at a time. Returns the columns between which pixels have weight.
+    """
+    finest, highlight = np.float32(merging[0]), np.float32(merging[1])
+    one, zero, least = np.float32(1.0), np.float32(0.0), np.float32(LEAST_CONTRAST)
+    row = coc[y]
+    top = _largest(row)
+    begin, end = 0, len(row)
+    level[:] = zero
+    share[:] = one
+    if weight.shape[0] > 0:
+        weights = weight[y]
+        for x in range(len(row)):
+            level[x] = zero if weights[x] > zero else np.float32(-2.0)
+        while end > 0 and level[end - 1] < zero:
+            end -= 1
+        while begin < end and level[begin] < zero:
+            begin += 1
+    if highest == 0 or begin == end or top < np.float32(2.0) * finest:
+        return begin, end
+    for number in range(1, highest + 1):
+        threshold = finest * np.float32(1 << number)
+        if threshold > top:
+            break
+        here, scale = np.float32(number), np.float32(1.0 / FADE) / threshold
+        for x in range(len(row)):
+            r = abs(row[x])
+            level[x] = here if (r >= threshold) & (level[x] >= zero) else level[x]
+            share[x] = min((r - threshold) * scale, one) if r >= threshold else share[x]
+    for k in range(values.shape[0]):
+        plane, bound = values[k, y], bounds[k]
+        for x in range(len(row)):
+            high = (level[x] > zero) & (abs(plane[x]) > bound * max(highlight * row[x] * row[x], least))
+            level[x] = -one if high else level[x]
+    return begin, end
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _add(cells, p, a, b, c, d, w, r, signed):  # type: ignore[no-untyped-def]
+    """Add to the record at ``p``."""
+    cells[p] += a
+    cells[p + 1] += b
+    cells[p + 2] += c
+    cells[p + 3] += d
+    cells[p + 4] += w
+    cells[p + 5] += r
+    cells[p + 6] += signed
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cells, reach, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
+    """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
+
+    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
+    """
+    width = coc.shape[1]
+    highest = sizes.shape[0] - 1
+    for level in range(1, highest + 1):
+        columns, start = sizes[level, 1], sizes[level, 2]
+        first, last = y0 >> level, (y1 - 1) >> level
+        cells[RECORD * (start + first * columns) : RECORD * (start + (last + 1) * columns)] = 0.0
+        reach[level, first : last + 1] = 0.0
+    c0, c1, c2, c3 = channel[0], channel[1], channel[2], channel[3]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    a, b, c, d = constant[0], constant[1], constant[2], constant[3]
+    weighted = weight.shape[0] > 0
+    levels, shares = np.empty(width, np.float32), np.empty(width, np.float32)
+    farthest = np.zeros(highest + 1, np.float32)
+    starts = np.empty(highest + 1, np.int64)
+    for y in range(y0, y1):
+        count = 0
+        begin, end = classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
+        for level in range(1, highest + 1):
+            starts[level] = sizes[level, 2] + (y >> level) * sizes[level, 1]
+        farthest[:] = 0.0
+        farthest[0] = -1.0
+        # The sums of the cell that the last pixel went to: neighbours mostly go to the same one.
+        current = -1
+        s0 = s1 = s2 = s3 = sw = sr = ss = zero
+        for x in range(begin, end):
+            level = int(levels[x])
+            signed = coc[y, x]
+            r = abs(signed)
+            if level <= 0:
+                if level == 0:
+                    farthest[0] = max(farthest[0], r)
+                elif level == -1:
+                    marks[y, count] = y * width + x
+                    count += 1
+                continue
+            if c0 >= 0:
+                a = values[c0, y, x]
+            if c1 >= 0:
+                b = values[c1, y, x]
+            if c2 >= 0:
+                c = values[c2, y, x]
+            if c3 >= 0:
+                d = values[c3, y, x]
+            p = RECORD * (starts[level] + (x >> level))
+            if p != current:
+                if current >= 0:
+                    _add(cells, current, s0, s1, s2, s3, sw, sr, ss)
+                current = p
+                s0 = s1 = s2 = s3 = sw = sr = ss = zero
+            whole = weight[y, x] if weighted else one
+            w = shares[x] * whole
+            s0 += w * a
+            s1 += w * b
+            s2 += w * c
+            s3 += w * d
+            sw += w
+            sr += w * r
+            ss += w * signed
+            farthest[level] = max(farthest[level], r)
+            if shares[x] < one:
+                level -= 1
+                farthest[level] = max(farthest[level], r)
+                if level > 0:
+                    w = whole - w
+                    p = RECORD * (starts[level] + (x >> level))
+                    _add(cells, p, w * a, w * b, w * c, w * d, w, w * r, w * signed)
+        if current >= 0:
+            _add(cells, current, s0, s1, s2, s3, sw, sr, ss)
+        counts[y] = count
+        reach[0, y] = farthest[0]
+        for level in range(1, highest + 1):
+            reach[level, y >> level] = max(reach[level, y >> level], farthest[level])
+
+
+@nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
+    """For rows ``y0 .. y1-1``: ``sums (H, C+1)`` of weight times magnitude, and of the weight of what is not zero."""
+    channels, _, width = values.shape
+    alive = np.empty(width, np.float32)
+    for y in range(y0, y1):
+        alive[:] = 0.0
+        for k in range(channels):
+            plane = values[k, y]
+            for x in range(width):
+                alive[x] = alive[x] if plane[x] == 0.0 else np.float32(1.0)
+        if weight.shape[0] > 0:
+            row = weight[y]
+            for x in range(width):
+                alive[x] *= row[x]
+        for k in range(channels):
+            plane, total = values[k, y], np.float32(0.0)
+            for x in range(width):
+                total += abs(plane[x]) * alive[x] if alive[x] > 0.0 else np.float32(0.0)
+            sums[y, k] = total
+        count = np.float32(0.0)
+        for x in range(width):
+            count += alive[x]
+        sums[y, channels] = count
+
+
+def usual(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Mean magnitude ``(C,)`` of every channel, over the pixels that hold anything: highlights are far above it."""
+    sums = np.empty((values.shape[1], len(values) + 1))
+    run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
+    *totals, count = sums.sum(0)
+    return (np.array(totals) / max(count, TINY)).astype(np.float32)
+
+
+def collect(
+    values: np.ndarray, coc: np.ndarray, weight: np.ndarray, lanes: Lanes, merging: Merging, highest: int
+) -> Levels:
+    """Sum ``values (C, H, W)`` with ``coc (H, W)`` and ``weight`` (of no rows: all 1) into the cells of all levels."""
+    height, width = coc.shape
+    bounds = usual(values, weight)
+    sizes = np.zeros((highest + 1, 3), np.int64)
+    count = 0
+    for level in range(1, highest + 1):
+        sizes[level] = -(-height >> level), -(-width >> level), count
+        count += sizes[level, 0] * sizes[level, 1]
+    cells = np.empty(RECORD * count, np.float32)
+    reach = np.empty((highest + 1, height), np.float64)
+    marks, counts = np.empty((height, width), np.int64), np.empty(height, np.int64)
+    work = partial(_collect, values, coc, weight, *lanes, merging, bounds, sizes, cells, reach, marks, counts)
+    tile = max(1 << highest, BAND // 2)  # no cell lies in two tiles
+    run_all(work, [(y, min(y + tile, height)) for y in range(0, height, tile)], "collect")
+    found = [marks[y, : counts[y]] for y in np.flatnonzero(counts)]
+    return Levels(sizes, cells, reach, np.concatenate([np.empty(0, np.int64), *found]), bounds)
+
+
+def bands(height: int) -> list[tuple[int, int]]:
+    """Pieces of work that together make up ``height`` rows; low pictures come in eight or so, for all threads."""
+    rows = min(max(-(-height // 8), 16), BAND)
+    return [(y, min(y + rows, height)) for y in range(0, height, rows)]

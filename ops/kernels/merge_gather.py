@@ -1,0 +1,291 @@
+"""numba kernels of the adjoint of `splat_merged` for CPU float32.
+
+The passes of the forward kernels, backwards: the gradient of the picture goes down to every level (the transpose of
+the interpolation) and is summed along x from the right (that of the running sum); every cell gathers its gradient;
+every pixel gathers its own on the lowest level and takes its share of those of its cells.
+"""
+
+import math
+from functools import partial
+
+import numba as nb
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.kernels.merge import bank_of, cell_radius, planes_of
+from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, bands, classify, collect
+from torchbokeh.ops.kernels.psf_bank import Bank, draw_psf, draw_slopes
+from torchbokeh.ops.kernels.rows import gather_rows
+from torchbokeh.ops.kernels.splat import shape_tables
+from torchbokeh.ops.merge import MARGIN, Merging
+from torchbokeh.ops.spans import MIN_RADIUS, Profile
+from torchbokeh.ops.system.threads import run_all
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _interleave(grad, out, first, lanes, y0, y1):  # type: ignore[no-untyped-def]
+    """Gradient of the sums, rows ``y0 .. y1-1``, four channels from ``first`` on: ``lanes (H, W, 4)``.
+
+    Where ``out`` holds anything, its channels but the last are quotients by the last.
+    """
+    channels, _, width = grad.shape
+    divided = out.shape[0] > 0
+    for y in range(y0, y1):
+        for k in range(4):
+            channel = first + k
+            if channel >= channels:
+                lanes[y, :, k] = 0.0
+            elif not divided:
+                lanes[y, :, k] = grad[channel, y]
+            elif channel < channels - 1:
+                for x in range(width):
+                    lanes[y, x, k] = grad[channel, y, x] / max(out[-1, y, x], np.float32(TINY))
+            else:
+                for x in range(width):
+                    total = np.float32(0.0)
+                    for other in range(channels - 1):
+                        total += grad[other, y, x] * out[other, y, x]
+                    cover = out[-1, y, x]
+                    lanes[y, x, k] = grad[channel, y, x] - (total / cover if cover > TINY else np.float32(0.0))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _sum_back(lanes, pad, sums, y0, y1):  # type: ignore[no-untyped-def]
+    """``sums (H, W + 2 pad, 4)``: what ``lanes (H, W, 4)`` hold from each column on, rows ``y0 .. y1-1``."""
+    width = lanes.shape[1]
+    for y in range(y0, y1):
+        s0 = s1 = s2 = s3 = 0.0
+        sums[y, pad + width :] = 0.0
+        for x in range(width - 1, -1, -1):
+            s0 += lanes[y, x, 0]
+            s1 += lanes[y, x, 1]
+            s2 += lanes[y, x, 2]
+            s3 += lanes[y, x, 3]
+            sums[y, pad + x, 0], sums[y, pad + x, 1], sums[y, pad + x, 2], sums[y, pad + x, 3] = s0, s1, s2, s3
+        for x in range(pad):
+            sums[y, x, 0], sums[y, x, 1], sums[y, x, 2], sums[y, x, 3] = s0, s1, s2, s3
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _across(fine, y, margin, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of ``fine`` (counted within the picture) to cells along x, ``out (w, 4)``; 0 outside."""
+    out[:] = 0.0
+    width = fine.shape[1]
+    if y < -margin or y >= fine.shape[0] - margin:
+        return
+    row = fine[y + margin]
+    cells = out.shape[0]
+    for i in range(cells):
+        x = 2 * (i - MARGIN) + margin
+        for side in range(2):
+            if 0 <= x + side < width:
+                beside = i + 1 if side else i - 1
+                for k in range(4):
+                    v = row[x + side, k]
+                    out[i, k] += np.float32(0.75) * v
+                    if 0 <= beside < cells:
+                        out[beside, k] += np.float32(0.25) * v
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _down(fine, margin, coarse, y0, y1):  # type: ignore[no-untyped-def]
+    """Rows ``y0 .. y1-1`` of the transpose of ``upsample / 4``: ``fine`` with its margin to ``coarse``."""
+    width = coarse.shape[1]
+    row = np.empty((width, 4), np.float32)
+    for y in range(y0, y1):
+        coarse[y] = 0.0
+        first = 2 * (y - MARGIN)
+        for k, share in ((-1, 0.25), (0, 0.75), (1, 0.75), (2, 0.25)):
+            _across(fine, first + k, margin, row)
+            coarse[y] += np.float32(0.25 * share) * row
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_wide(sums, height, width, pad, x, y, coc, shape, found):  # type: ignore[no-untyped-def]
+    """`gather_rows` for a PSF that is not in the bank, centred on the cell ``(x, y)``."""
+    shapes, bulge, inv_area = shape
+    s = 1 if coc < 0.0 else 0
+    r = max(abs(coc), MIN_RADIUS)
+    first = max(-y, math.ceil(max(r * shapes[s, 0, 0] - 0.5, -1e9)))
+    n = max(min(height - 1 - y, math.floor(min(r * shapes[s, -1, 0] + 0.5, 1e9))) - first + 1, 0)
+    border = np.float64(width)
+    rows, moves = np.empty((4, n + 1), np.float64), np.empty((3, n), np.float64)
+    columns, weights, slopes = np.empty((n, 2), np.int64), np.empty((n, 4), np.float64), np.empty((n, 4), np.float64)
+    draw_psf(r, x + 0.5, first, n, 0.0, border, shapes, s, bulge, inv_area, rows, columns, weights)
+    draw_slopes(r, x + 0.5, first, n, 0.0, border, shapes, s, bulge, inv_area, rows, moves, slopes)
+    stride = 4 * (width + 2 * pad)
+    gather_rows(sums, (y + first) * stride + 4 * pad, stride, columns, weights, slopes, 0, n, found)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads, y0, y1):  # type: ignore[no-untyped-def]
+    """Gradients of the cells of rows ``y0 .. y1-1``: of the lanes, and of each unit of share times radius (px)."""
+    bank_steps, mirrored, pad, firsts, ends, columns, weights, slopes = bank
+    in_bank = mirrored if mirrored else len(firsts)
+    stride = 4 * (width + 2 * pad)
+    scale = 1.0 / (1 << level)
+    found = np.empty(8, np.float64)
+    for j in range(y0, y1):
+        y = j + MARGIN
+        for i in range(across):
+            p = RECORD * (j * across + i)
+            if cells[p + 4] == 0.0:
+                continue
+            smaller = cell_radius(cells, p, scale)
+            radius = np.rint(bank_steps * smaller)
+            if radius < in_bank:
+                k = int(radius)
+                if cells[p + 6] < 0.0:
+                    k += mirrored
+                first = y + firsts[k]
+                begin = max(-first, 0)
+                stop = min(height - first, ends[k + 1] - ends[k])
+                o = (first + begin) * stride + 4 * (pad + MARGIN + i)
+                gather_rows(sums, o, stride, columns, weights, slopes, ends[k] + begin, ends[k] + stop, found)
+            else:
+                coc = math.copysign(radius / bank_steps, cells[p + 6])
+                _gather_wide(sums, height, width, pad, i + MARGIN, y, coc, shape, found)
+            slope = 0.0
+            for k in range(4):
+                grads[p + k] = found[k]
+                slope += found[4 + k] * cells[p + k]
+            # By the mean radius, which is larger, and by each unit of its sum.
+            grads[p + 4] = slope * (scale * (cells[p + 5] / cells[p + 4]) / smaller) * scale / cells[p + 4]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _gather_pixels(  # type: ignore[no-untyped-def]
+    values, coc, weight, channel, constant, merging, bounds, sizes, sums, bank, shape, grads,
+    grad_values, grad_coc, grad_weight, y0, y1
+):  # fmt: skip
+    """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells."""
+    bank_steps, mirrored, pad, firsts, ends, columns, weights, slopes = bank
+    in_bank = mirrored if mirrored else len(firsts)
+    height, width = coc.shape
+    stride = 4 * (width + 2 * pad)
+    highest = sizes.shape[0] - 1
+    levels, shares = np.empty(width, np.float32), np.empty(width, np.float32)
+    found = np.empty(8, np.float64)
+    grad = np.empty(5, np.float64)
+    for y in range(y0, y1):
+        classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
+        for x in range(width):
+            level, share = int(levels[x]), shares[x]
+            signed = np.float64(coc[y, x])
+            whole = weight[y, x] if weight.shape[0] > 0 else np.float32(1.0)
+            grad[:] = 0.0
+            if level == -2:
+                lowest = np.float32(0.0)
+            elif level <= 0:
+                lowest = np.float32(1.0)
+            else:
+                lowest = np.float32(1.0) - share if level == 1 else np.float32(0.0)
+                for part in range(2):
+                    here = level - part
+                    w = np.float32(1.0) - share if part else share
+                    if here > 0 and w > 0.0:
+                        p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
+                        for k in range(4):
+                            grad[k] += w * grads[p + k]
+                        grad[4] += w * whole * grads[p + 4]
+            if lowest > 0.0:
+                radius = np.rint(bank_steps * abs(signed))
+                if radius < in_bank:
+                    k = int(radius)
+                    if signed < 0.0:
+                        k += mirrored
+                    first = y + firsts[k]
+                    begin = max(-first, 0)
+                    stop = min(height - first, ends[k + 1] - ends[k])
+                    o = (first + begin) * stride + 4 * (pad + x)
+                    gather_rows(sums, o, stride, columns, weights, slopes, ends[k] + begin, ends[k] + stop, found)
+                else:
+                    coc_here = math.copysign(radius / bank_steps, signed)
+                    _gather_wide(sums, height, width, pad, x, y, coc_here, shape, found)
+                moves = radius > bank_steps * MIN_RADIUS
+                for k in range(4):
+                    grad[k] += lowest * found[k]
+                    if moves:
+                        value = values[channel[k], y, x] if channel[k] >= 0 else constant[k]
+                        grad[4] += found[4 + k] * lowest * whole * value
+            by_weight = 0.0
+            for k in range(4):
+                if channel[k] >= 0:
+                    grad_values[channel[k], y, x] = whole * grad[k]
+                    if level != -2:
+                        by_weight += values[channel[k], y, x] * grad[k]
+                else:
+                    by_weight += constant[k] * grad[k]
+            if weight.shape[0] > 0:
+                grad_weight[y, x] = by_weight if channel[0] == 0 else grad_weight[y, x] + by_weight
+            slope = grad[4] if signed > 0.0 else -grad[4]
+            grad_coc[y, x] = slope if channel[0] == 0 else grad_coc[y, x] + slope
+
+
+def gather_merged(
+    grad: Tensor,
+    out: Tensor | None,
+    values: Tensor,
+    coc: Tensor,
+    weight: Tensor | None,
+    profile: Profile,
+    merging: Merging,
+    highest: int,
+    ones: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of ``values``, ``coc`` and ``weight`` (empty without one).
+
+    ``out`` is what the forward pass gave if it was normalised.
+    """
+    b, channels, h, w = values.shape
+    shape = shape_tables(profile)
+    bank = bank_of(merging, shape, slopes=True)
+    source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
+    weights = planes_of(weight, b)
+    grad_values, grad_coc = torch.empty_like(source), torch.empty(b, 1, h, w, dtype=torch.float32)
+    grad_weight = torch.empty(b, *weights[0].shape, dtype=torch.float32)
+    grad_np = grad.contiguous().numpy()
+    divided = np.empty((b, 0, h, w), np.float32) if out is None else out.contiguous().numpy()
+    for n in range(b):
+        for group in range(-(-(channels + ones) // 4)):
+            scene = source[n].numpy(), radii[n, 0], weights[n]
+            lanes = Lanes.of(group, channels, ones)
+            levels = collect(*scene, lanes, merging, highest)
+            incoming = np.empty((h, w, 4), np.float32)
+            interleave = partial(_interleave, grad_np[n], divided[n], 4 * group, incoming)
+            run_all(interleave, bands(h), "gradient of the picture")
+            grads = _gather_levels(levels, incoming, bank, shape)
+            sums = _summed(incoming, bank.reach).reshape(-1)
+            kernel = partial(
+                _gather_pixels,
+                *(*scene, *lanes, merging, levels.bounds, levels.sizes, sums, bank, shape),
+                *(grads, grad_values[n].numpy(), grad_coc[n, 0].numpy(), grad_weight[n].numpy()),
+            )
+            run_all(kernel, bands(h), "gather pixels")
+    return grad_values, grad_coc, grad_weight[:, None]
+
+
+def _summed(lanes: np.ndarray, pad: int) -> np.ndarray:
+    h, w, _ = lanes.shape
+    sums = np.empty((h, w + 2 * pad, 4), np.float64)
+    run_all(partial(_sum_back, lanes, pad, sums), bands(h), "sums")
+    return sums
+
+
+def _gather_levels(levels: Levels, fine: np.ndarray, bank: Bank, shape: tuple[np.ndarray, float, float]) -> np.ndarray:
+    """Gradients of all cells, in records like theirs, from the gradient ``fine (H, W, 4)`` of the picture."""
+    grads = np.empty_like(levels.cells)
+    margin = 0
+    for level in range(1, len(levels.sizes)):
+        rows, across, first = levels.sizes[level]
+        coarse = np.empty((rows + 2 * MARGIN, across + 2 * MARGIN, 4), np.float32)
+        run_all(partial(_down, fine, margin, coarse), bands(len(coarse)), "levels")
+        sums = _summed(coarse, bank.reach).reshape(-1)
+        here = slice(RECORD * first, RECORD * (first + rows * across))
+        size = coarse.shape[:2]
+        kernel = partial(_gather_cells, levels.cells[here], across, level, sums, *size, bank, shape, grads[here])
+        run_all(kernel, bands(rows), "gather cells")
+        fine, margin = coarse, MARGIN
+    return grads

@@ -1,0 +1,1 @@
+"""Splatting from banks of sparse point-spread functions."""

@@ -1,0 +1,1 @@
+"""Surfaces, what they hide, and how they are put over one another."""

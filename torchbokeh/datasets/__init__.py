@@ -1,0 +1,1 @@
+"""Scenes with ground truth to train on, drawn on the fly or written as shards."""

@@ -1,0 +1,1 @@
+"""In training and deployment: augmentation, integration networks, export."""

@@ -1,0 +1,172 @@
+"""What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from torchbokeh.lens.dispersion import Light
+from torchbokeh.ops.convolve import CONVOLVE_FROM
+from torchbokeh.plan.quality import Quality
+from torchbokeh.psfs.combined import STILL
+
+Hidden = Literal["nothing", "filled", "given", "layers"]
+
+STEP = 2.0
+"""Change of a radius in px over one part of the exposure."""
+
+MOST_PARTS = 12
+"""Parts of the exposure, at most: of larger radii a larger step is not seen."""
+
+_HIDDEN = {
+    "filled": "what it hides is filled from its surroundings (pass background= if you know it)",
+    "given": "what it hides comes from background=",
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a look at a scene finds.
+
+    Attributes:
+        size: ``(H, W)`` of the image.
+        coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
+        clamped: share of the pixels whose radius ``max_coc`` cut.
+        motion: longest displacement in px over the open shutter.
+        pan: the displacement (dx, dy) that all pixels share; None where they do not.
+        approach: largest change of a signed radius in px while the shutter is open.
+        layer_count: number of input layers; 0 for a plain image.
+        layers: indices of those that hold anything.
+        opaque: indices of those that cover everything: their coverage needs no looking at.
+    """
+
+    size: tuple[int, int]
+    coc_range: tuple[float, float]
+    clamped: float
+    motion: float
+    pan: tuple[float, float] | None
+    approach: float
+    layer_count: int
+    layers: tuple[int, ...]
+    opaque: tuple[int, ...]
+
+    @property
+    def moves(self) -> bool:
+        """Whether motion is to be seen."""
+        return self.motion > STILL[0] or self.approaches
+
+    @property
+    def approaches(self) -> bool:
+        """Whether motion toward the camera, or away, is to be seen."""
+        return self.approach > STILL[0]
+
+    @property
+    def parts(self) -> int:
+        """Into how many parts of constant radius the exposure is cut."""
+        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
+
+
+@dataclass(frozen=True)
+class Plan(Seen):
+    """What a scene needs, and by that what is left out.
+
+    Attributes, beside those of what was `Seen`:
+        sharp: every radius is below half a pixel and nothing moves: the image passes through.
+        hidden: how what the foreground hides is known.
+        bins: for every surface, front to back, the centres of its soft bins in px of CoC.
+        subapertures: the lens is cut into the square of this many pieces.
+        aperture: the shape of the aperture, for the reader.
+        quality: the operating point.
+        highest: the coarsest level that pixels are merged on; 0 if none are.
+        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
+        colours: the lights that a lens with dispersion takes a picture in, one by one; none where that is not seen.
+        spread: how far it spreads them in px, in radius and place.
+        fading: plans with a part less, and how much their pictures count for in a mean with that of this plan: where a
+            part begins to be needed, it does so gradually.
+    """
+
+    sharp: bool
+    hidden: Hidden
+    bins: tuple[tuple[float, ...], ...]
+    subapertures: int
+    aperture: str
+    quality: Quality
+    highest: int
+    predicted_error: float
+    colours: tuple["Colour", ...] = ()
+    spread: float = 0.0
+    fading: tuple[tuple["Plan", float], ...] = ()
+
+    @property
+    def uniform(self) -> float | None:
+        """The signed radius in px that all pixels share, where one convolution does it; else None."""
+        low, high = self.coc_range
+        if low != high or self.hidden != "nothing":
+            return None
+        if self.moves:
+            return low if self.pan is not None and not self.approaches else None
+        return low if self.highest == 0 and abs(low) >= CONVOLVE_FROM else None
+
+    @property
+    def cuts(self) -> list[int]:
+        """All numbers of sub-apertures each way that occur in it and in its parts."""
+        others = [*(one.plan for one in self.colours), *(other for other, _ in self.fading)]
+        return sorted({self.subapertures, *(count for other in others for count in other.cuts)})
+
+    def __str__(self) -> str:
+        height, width = self.size
+        low, high = self.coc_range
+        head = f"{width} x {height} image, CoC {low:+.1f} to {high:+.1f} px (negative: in front of the focus plane)."
+        if self.colours:
+            single = all(max(c.light.rgb) == 1 for c in self.colours)
+            how = "red, green and blue" if single else f"{len(self.colours)} bands of the spectrum"
+            head += f"\nDispersion spreads colours by up to {self.spread:.1f} px: {how} are blurred one by one."
+        if self.sharp and not self.colours:
+            return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.uniform is not None:
+            moved = f", moved by ({self.pan[0]:.1f}, {self.pan[1]:.1f}) px" if self.moves and self.pan else ""
+            return f"{head}\nEvery pixel has the same PSF ({self.aperture}{moved}): a single convolution."
+        lines = [head]
+        counts = " and ".join(str(len(b)) for b in self.bins)
+        if self.hidden == "layers":
+            lines.append(
+                f"{len(self.bins)} layers of the input are blurred ({counts} bins) and composed front to back."
+            )
+        elif len(self.bins) == 2:
+            lines.append(f"The foreground is blurred over the rest ({counts} bins); {_HIDDEN[self.hidden]}.")
+        else:
+            lines.append(f"One surface in {counts} bin{'s' if len(self.bins[0]) > 1 else ''}: no foreground is needed.")
+        if self.moves:
+            lines.append(f"Motion up to {self.motion:.1f} px, in one splat with the defocus, through the whole lens.")
+            if self.approaches:
+                lines.append(f"Motion in depth changes radii by up to {self.approach:.1f} px, in {self.parts} steps.")
+        elif self.subapertures > 1:
+            lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
+        else:
+            lines.append(f"{self.aperture}, whole: nothing hides anything, or the blur is too small to show it.")
+        if self.highest:
+            lines.append(
+                f"Quality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
+                f"merged by radius; predicted relative error of the splats {self.predicted_error:.2g}."
+            )
+        elif self.quality.merging is not None:
+            lines.append(f"Quality {self.quality.name!r}: the blur is too small for pixels to be merged.")
+        if self.fading:
+            share = sum(share for _, share in self.fading)
+            lines.append(f"Part of this is hardly needed yet: {100 * share:.2g} % of the picture do without.")
+        if self.clamped:
+            lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
+        return "\n".join(lines)
+
+
+class Colour(NamedTuple):
+    """One light of a picture.
+
+    Attributes:
+        light: its wavelength, and what it adds to each channel.
+        enlarged: whether its picture may have another size.
+        plan: what it needs.
+    """
+
+    light: Light
+    enlarged: bool
+    plan: Plan

@@ -1,0 +1,1 @@
+"""Dispersion against its reference."""

@@ -1,0 +1,1 @@
+"""Motion against dense scatters and the accumulation buffer."""

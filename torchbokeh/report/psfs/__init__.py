@@ -1,0 +1,1 @@
+"""How well sparse point-spread functions do."""

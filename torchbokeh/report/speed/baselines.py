@@ -1,0 +1,174 @@
+"""The baselines by name: well-known ways to blur one layer, each at its best settings.
+
+A baseline that needs a package which is not installed is left out; `absent` says which and why.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchbokeh.report.speed.discs import disc
+from torchbokeh.report.speed.layered import BLOCK, direct_convolution, fft_convolution, layer_work, layered
+from torchbokeh.report.speed.methods import Method
+
+LAYERS = (8, 16, 32)
+JOINS = {"layered FFT": ("over", "over, normalised", "sum, normalised"), "layered direct": ("over", "over, normalised")}
+
+# Seconds of one thread per elementary step, on a processor of about 3 GHz with vectors of 512 bits.
+_POINT, _ROW_POINT, _TEST, _FFT_STEP, _PRODUCT = 1.8e-9, 1.2e-9, 1.4e-9, 1.5e-10, 2.5e-10
+
+
+def baselines() -> dict[str, Method]:
+    """Every baseline that can run here, by name."""
+    found = [*_scatters(), *_layered_methods(), *_fixed_kernels()]
+    return {method.name: method for method in found}
+
+
+def absent() -> list[str]:
+    """A line for every baseline whose package is not installed."""
+    lines = []
+    if find_spec("numba") is None:
+        lines.append("dense scatter and gather filter: numba is not installed (`pip install torchbokeh[cpu]`)")
+    if not _blurgenerator_is_there():
+        lines.append("blurgenerator: not installed (`pip install blurgenerator`)")
+    return lines
+
+
+def _scatters() -> list[Method]:
+    if find_spec("numba") is None:
+        return []
+    from torchbokeh.report.speed.scatter import dense_scatter, gather
+
+    def area(coc: Tensor) -> float:
+        return math.pi * (coc.double().square() + 1).sum().item()
+
+    discs = "every pixel adds its disc, from a table of discs in steps of 1/4 px, compiled with numba"
+    return [
+        Method(
+            "dense scatter",
+            "dense scatter",
+            f"{discs}, point by point",
+            partial(dense_scatter, by_rows=False),
+            lambda coc: _POINT * area(coc),
+        ),
+        Method(
+            "dense scatter by rows",
+            "dense scatter",
+            f"{discs}, whole rows of a disc at once",
+            partial(dense_scatter, by_rows=True),
+            lambda coc: _ROW_POINT * area(coc),
+        ),
+        Method(
+            "gather",
+            "gather",
+            "every pixel collects from all pixels of a search window whose disc, with an edge 1 px wide, covers it; "
+            "the window is that of the largest disc that reaches a tile of 16 px; compiled with numba",
+            gather,
+            _gather_work,
+        ),
+    ]
+
+
+def _gather_work(coc: Tensor) -> float:
+    from torchbokeh.report.speed.scatter import TILE, search_windows
+
+    return _TEST * math.pi * TILE**2 * float(np.square(search_windows(coc), dtype=np.float64).sum())
+
+
+def _layered_methods() -> list[Method]:
+    kinds = {"layered FFT": (fft_convolution, _FFT_STEP), "layered direct": (direct_convolution, _PRODUCT)}
+    explained = {
+        "over": "hard bins of the signed CoC, each convolved with its disc, put over one another",
+        "over, normalised": "hard bins of the signed CoC, each convolved with its disc, put over one another and "
+        "divided by alpha",
+        "sum, normalised": "hard bins of the radius, each convolved with its disc, added up and divided by coverage",
+    }
+    found = []
+    for family, (convolve, step) in kinds.items():
+        for count in LAYERS:
+            for join in JOINS[family]:
+                found.append(
+                    Method(
+                        f"{family} {count}, {join}",
+                        family,
+                        f"{count} {explained[join]}",
+                        partial(layered, layers=count, join=join, convolve=convolve),
+                        partial(_layer_seconds, count=count, which=list(kinds).index(family), step=step),
+                        normalised=join != "over",
+                    )
+                )
+    return found
+
+
+def _layer_seconds(coc: Tensor, count: int, which: int, step: float) -> float:
+    return step * layer_work(coc, count)[which]
+
+
+def _fixed_kernels() -> list[Method]:
+    """Baselines that know one radius for the whole picture."""
+    from kornia.filters import fft_conv, filter2d
+
+    def direct_work(coc: Tensor) -> float:
+        side = 2 * coc.abs().max().item() + 1
+        return (_PRODUCT if side <= BLOCK else 25 * _PRODUCT) * 4 * coc.numel() * side**2
+
+    def fft_work(coc: Tensor) -> float:
+        return _FFT_STEP * 9 * 2.5 * coc.numel() * math.log2(coc.numel())
+
+    found = [
+        Method(
+            "kornia filter2d",
+            "fixed kernel",
+            "kornia.filters.filter2d with one disc, zeros beyond the border, divided by coverage",
+            partial(_one_kernel, convolve=filter2d),
+            direct_work,
+            one_depth=True,
+        ),
+        Method(
+            "kornia fft_conv",
+            "fixed kernel",
+            "kornia.filters.fft_conv with one disc, zeros beyond the border, divided by coverage",
+            partial(_one_kernel, convolve=fft_conv),
+            fft_work,
+            one_depth=True,
+        ),
+    ]
+    if _blurgenerator_is_there():
+        found.append(
+            Method(
+                "blurgenerator",
+                "fixed kernel",
+                "blurgenerator.lens_blur: five complex Gaussians for one disc; 8 bits, as many threads as processors",
+                _blurgenerator,
+                lambda coc: 5e-9 * coc.numel() * (20 + 2 * coc.abs().max().item()),
+                normalised=False,  # by its five Gaussians to about a hundredth
+                one_depth=True,
+            )
+        )
+    return found
+
+
+def _one_kernel(image: Tensor, coc: Tensor, convolve: Callable[..., Tensor]) -> Tensor:
+    """One disc for the whole picture, through a filter of kornia's; ``coc`` is the same everywhere."""
+    kernel = torch.from_numpy(disc(coc.flatten()[0].abs().item())).to(image)[None]
+    blurred = convolve(torch.cat([image, torch.ones_like(coc)], 1), kernel, border_type="constant")
+    return blurred[:, :3] / blurred[:, 3:]
+
+
+def _blurgenerator_is_there() -> bool:
+    return find_spec("blurgenerator") is not None and find_spec("cv2") is not None
+
+
+def _blurgenerator(image: Tensor, coc: Tensor) -> Tensor:
+    """The package takes pictures as a screen shows them, from 0 to 255, and undoes the exponent that it is told."""
+    from blurgenerator import lens_blur
+
+    shown = (image[0].permute(1, 2, 0) ** (1 / 2.2) * 255).numpy()
+    radius = max(coc.flatten()[0].abs().item(), 0.5)
+    blurred = lens_blur(shown, radius=radius, components=5, exposure_gamma=2.2)
+    return (torch.from_numpy(blurred).float().permute(2, 0, 1)[None] / 255) ** 2.2

@@ -1,0 +1,71 @@
+"""The share of each stage of the one-layer splat."""
+
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.dispatch import numba_is_there
+from torchbokeh.ops.system.threads import recorded
+from torchbokeh.report.scenes import photo
+from torchbokeh.report.settings import Settings
+from torchbokeh.report.speed.experiments import Row, Say
+from torchbokeh.report.speed.methods import QUALITIES, own_methods, own_name
+from torchbokeh.report.speed.roofline import least_seconds, measured_rates
+
+Recorder = Callable[[], AbstractContextManager[dict[str, float]]]
+
+REST = "everything else"
+"""What no stage accounts for."""
+
+
+def stages(settings: Settings, say: Say) -> list[Row]:
+    """Seconds of every stage of a splat of ``photo``, for every quality and radius.
+
+    Returns:
+        Rows with ``quality``, ``radius``, ``stage``, ``seconds`` (median), ``share`` of the whole, and
+        ``least_seconds``, a lower bound by what has to be read, written and drawn (see `roofline`); None where none is
+        known. Nothing without numba, whose kernels record their stages.
+    """
+    if not numba_is_there():
+        return []
+    rates = measured_rates()
+    rows: list[Row] = []
+    for radius in settings.photo_radii:
+        say(f"share of each stage: radius {radius:g} px")
+        seen = photo(settings.photo_size, radius)
+        for quality in QUALITIES:
+            run = own_methods()[own_name(quality)].run
+            found = shares(partial(run, seen.image, seen.coc), recorded, settings.repeat)
+            least = least_seconds(seen.image, seen.coc, quality, rates)
+            rows += [
+                {"quality": quality, "radius": radius, **row, "least_seconds": least.get(row["stage"])} for row in found
+            ]
+    return rows
+
+
+def shares(work: Callable[[], Tensor], recorded: Recorder, repeat: int) -> list[Row]:
+    """Median seconds of every stage of some work, and their share of its whole.
+
+    Args:
+        work: it runs once more, to warm up.
+        recorded: a context manager that gives the dictionary it writes seconds by stage into.
+        repeat: how often.
+    """
+    whole, parts = [], []
+    with torch.inference_mode():
+        work()
+        for _ in range(repeat):
+            start = time.perf_counter()
+            with recorded() as found:
+                work()
+            whole.append(time.perf_counter() - start)
+            parts.append({**found, REST: whole[-1] - sum(found.values())})
+    total = statistics.median(whole)
+    names = dict.fromkeys(name for part in parts for name in part)
+    medians = {name: statistics.median(part.get(name, 0.0) for part in parts) for name in names}
+    return [{"stage": name, "seconds": value, "share": value / total} for name, value in medians.items()]

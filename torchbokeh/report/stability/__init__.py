@@ -1,0 +1,1 @@
+"""Numerical stability: cases, bounds and oracles."""

@@ -1,0 +1,220 @@
+"""Slow splats in double, by plain sums: what banks of sparse PSFs are compared with.
+
+Which sample of a bank a pixel takes, where it lies and which pixels are highlights are read from the bank and its
+renderer: that is what is asked. How it is drawn is written anew, with no list of pixels, no running sum, no Fourier
+transform and no kernel of numba's.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchbokeh.banks.highlights import BRIGHT, _area, share_of_others, usual
+from torchbokeh.banks.splat import _confined, _far_beyond
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.dense import dense_spans
+from torchbokeh.ops.integrate import lattice_green
+from torchbokeh.ops.merge import LEAST_CONTRAST
+from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.psfs.aperture import Disc
+from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.combined import Combined
+from torchbokeh.psfs.model import Labels, Place
+from torchbokeh.psfs.represent import DOMAINS
+
+FINE = 2
+"""Samples along each side of a pixel that the capsule of a highlight is drawn by (`torchbokeh.ops.capsules`)."""
+
+POINTS = 1 << 21
+"""Points that are expanded at a time."""
+
+
+def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor:
+    """What `torchbokeh.banks.splat.splat_bank` defines, without merging.
+
+    Args:
+        values: ``(B, C, H, W)`` float64, what each pixel spreads, and last the coverage.
+        parts: labels, of which each spreads an equal part.
+        bank: the PSFs.
+
+    Returns:
+        ``(B, C, H, W)``, float64.
+    """
+    extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
+    if not bool((values != 0).any()):
+        return values
+    values = values / len(parts)
+    seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
+    light = torch.stack([t for t, _ in seen]).mean(0)
+    ordinary = usual(light)
+    bound = ordinary * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+    bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
+    kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
+    out = torch.zeros_like(values)
+    for own, part in seen:
+        rest = own * kept
+        lit = own - rest
+        still = None if part.coc is None else bank.model.still(part)
+        if still is not None and part.coc is not None:
+            resting, rest = rest * still, rest * (1 - still)
+            if bool((resting != 0).any()):
+                out = out + dense_spans(resting, part.coc, Disc().profile())
+        out = out + dense_samples(rest, part, bank)
+        if bool(bright.any()):
+            out = out + (capsules(lit, part) if isinstance(bank.model, Combined) else _pictured(lit, part, bank))
+    return out
+
+
+def _within(values: Tensor, part: Labels) -> tuple[Tensor, Labels]:
+    """Discs that cover the whole picture all the time are even there, and so are as good as smaller ones at rest."""
+    assert part.coc is not None
+    zero = torch.zeros_like(values[:, :2])
+    motion, offset = (zero if t is None else t for t in (part.motion, part.offset))
+    radius, diagonal = part.coc.abs(), math.hypot(*values.shape[2:]) + 1
+    wide = radius > diagonal + motion.norm(dim=1, keepdim=True) / 2 + offset.norm(dim=1, keepdim=True)
+    values = torch.where(wide, values * (diagonal / radius.clamp_min(1.0)).square(), values)
+    motion, offset = (torch.where(wide, 0.0, t) for t in (motion, offset))
+    return values, Labels(torch.where(wide, diagonal, part.coc), part.depth, motion, offset, part.field)
+
+
+def dense_samples(values: Tensor, labels: Labels, bank: PsfBank) -> Tensor:
+    """Every pixel's nearest sample, point by point; each domain is undone by the sum that defines it."""
+    out = torch.zeros_like(values)
+    for place, number in _places(labels, bank):
+        for name in DOMAINS:
+            out = out + _undone(values, place, number, bank, name)
+    return out
+
+
+def _places(labels: Labels, bank: PsfBank) -> list[tuple[Place, Tensor]]:
+    """Where the PSFs of each pixel lie, with all that scales them in ``frame`` and ``scale``, and their samples."""
+    found = []
+    for place in bank.model.places(labels):
+        coordinates = place.coordinates.movedim(1, -1)
+        number = bank.model.grid.index(coordinates)
+        factor = torch.ones_like(place.coordinates[:, :1])
+        extent = bank.model.extent(coordinates)
+        if extent is not None:
+            factor = (extent / bank.extents[number])[:, None]
+        frame = place.frame
+        if frame is None:
+            frame = torch.eye(2, dtype=torch.float64)[None, :, :, None, None].expand(-1, -1, -1, *number.shape[1:])
+        shift = torch.zeros_like(factor) if place.offset is None else place.offset
+        if labels.offset is not None:
+            shift = shift + labels.offset
+        scale = factor if place.scale is None else place.scale * factor
+        found.append((place._replace(frame=frame * factor[:, None], scale=scale, offset=shift), number))
+    return found
+
+
+def _undone(values: Tensor, place: Place, number: Tensor, bank: PsfBank, domain: str) -> Tensor:
+    """The samples of one domain: their points in a buffer, and the sum that undoes the domain's operator."""
+    height, width = values.shape[2:]
+    used = (bank.domains == DOMAINS.index(domain))[number][:, None] & (values != 0).any(1, keepdim=True)
+    if not bool(used.any()):
+        return torch.zeros_like(values)
+    assert place.scale is not None
+    spread = torch.where(used, values if place.share is None else values * place.share, 0.0)
+    colours = bank.values.shape[1]
+    if bank.model.tints:
+        gains = bank.gains().double()[number].movedim(-1, 1).clamp_min(TINY)
+        spread = torch.cat([spread[:, :-colours], spread[:, -colours:] / gains], 1)
+    if domain == "laplacian":
+        spread = spread / place.scale.square()
+    buffer, left, top = _pointed(spread, place, number, bank, used)
+    rows, columns = (
+        n + torch.arange(m, dtype=torch.float64) for n, m in zip((top, left), buffer.shape[2:], strict=True)
+    )
+    y, x = torch.arange(height)[:, None], torch.arange(width)[:, None]
+    if domain == "direct":
+        return _product((y == rows).double(), buffer, (x == columns).double())
+    if domain == "scanline":
+        return _product((y == rows).double(), buffer, (x >= columns).double())
+    away_y, away_x = (y - rows).abs().long(), (x - columns).abs().long()
+    green = lattice_green(int(away_y.max()) + 1, int(away_x.max()) + 1)
+    # All pairs of a row of the picture and one of the buffer that are as far apart, one distance after the other.
+    lines = (_product((away_y == n).double(), buffer, green[n, away_x]) for n in range(len(green)))
+    return torch.stack(list(lines)).sum(0)
+
+
+def _product(over_rows: Tensor, buffer: Tensor, over_columns: Tensor) -> Tensor:
+    return torch.einsum("vy,bcyx,ux->bcvu", over_rows, buffer, over_columns)
+
+
+def _pointed(spread: Tensor, place: Place, number: Tensor, bank: PsfBank, used: Tensor) -> tuple[Tensor, int, int]:
+    """All points, each shared bilinearly by four pixels, and where the buffer that holds them begins (x, y)."""
+    assert place.frame is not None
+    assert place.offset is not None
+    batch, channels = spread.shape[:2]
+    n, _, y, x = used.nonzero().unbind(1)
+    sample = number[n, y, x]
+    sizes = (bank.counts[sample + 1] - bank.counts[sample]).long()
+    owner = torch.arange(len(n)).repeat_interleave(sizes)
+    point = torch.arange(len(owner)) - (sizes.cumsum(0) - sizes)[owner] + bank.counts[sample].long()[owner]
+    frame, offset = place.frame.expand(batch, -1, -1, -1, -1), place.offset.expand(batch, 2, -1, -1)
+    matrix, centre = frame[n, :, :, y, x], torch.stack([x, y], 1) + offset[n, :, y, x]
+    target = centre[owner] + (matrix[owner] @ bank.offsets[point].double()[..., None])[..., 0]
+    low = target.floor()
+    left, top = (int(v) for v in low.amin(0))
+    right, bottom = (int(v) + 2 for v in low.amax(0))
+    width = right - left
+    buffer = torch.zeros(channels, batch * (bottom - top) * width, dtype=torch.float64)
+    values = spread[n, :, y, x].T
+    colour = torch.arange(channels) % bank.values.shape[1]
+    for part in torch.arange(len(owner)).split(POINTS):
+        who, share = owner[part], target[part] - low[part]
+        light = values[:, who] * bank.values[point[part]].double().T[colour]
+        column, row = (low[part] - torch.tensor([left, top])).long().unbind(1)
+        first = (n[who] * (bottom - top) + row) * width + column
+        for right_of, below in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            weight = (share[:, 0] if right_of else 1 - share[:, 0]) * (share[:, 1] if below else 1 - share[:, 1])
+            buffer.index_add_(1, first + below * width + right_of, light * weight)
+    return buffer.reshape(channels, batch, bottom - top, width).movedim(0, 1), left, top
+
+
+def _pictured(values: Tensor, labels: Labels, bank: PsfBank) -> Tensor:
+    """Highlights: samples as pictures, of which each pixel is drawn as several points where it is turned or scaled."""
+    out = torch.zeros_like(values)
+    alive = (values != 0).any(1)
+    for place, number in _places(labels, bank):
+        assert place.scale is not None
+        turned = bank.model.turns or float((place.scale - 1).abs().max()) > 0
+        fine = max(1, math.ceil(2 * float(place.scale.max()))) if turned else 1
+        used = number[alive].bincount(minlength=len(bank)) > 0
+        out = out + _undone(values, place, number, bank.dense(used, fine), "direct")
+    return out
+
+
+def capsules(values: Tensor, labels: Labels) -> Tensor:
+    """Highlights: discs along a segment, each pixel of the picture by `FINE` samples each way, and a sum of 1."""
+    out = torch.zeros_like(values)
+    height, width = values.shape[2:]
+    assert labels.coc is not None
+    motion = torch.zeros_like(values[:, :2]) if labels.motion is None else labels.motion
+    offset = torch.zeros_like(motion) if labels.offset is None else labels.offset
+    steps = (torch.arange(FINE, dtype=torch.float64) + 0.5) / FINE - 0.5
+    for n, y, x in (values != 0).any(1).nonzero().tolist():
+        radius = max(abs(float(labels.coc[n, 0, y, x])), MIN_RADIUS)
+        way, at = motion[n, :, y, x], offset[n, :, y, x]
+        length = float(way.norm())
+        ahead = way / length if length >= 2e-3 else torch.tensor([1.0, 0.0], dtype=torch.float64)
+        reach = math.ceil(radius + float((way.abs() / 2 + at.abs()).max())) + 1
+        side = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        v = (side[:, None] + steps).flatten()[:, None] - at[1]
+        u = (side[:, None] + steps).flatten() - at[0]
+        along, across = u * ahead[0] + v * ahead[1], v * ahead[0] - u * ahead[1]
+        chord = (radius**2 - across.square()).clamp_min(0).sqrt()
+        if length < 2e-3:
+            light = (along.abs() <= chord).double() * (chord > 2e-6)
+        else:
+            stop, start = torch.minimum(along + length / 2, chord), torch.maximum(along - length / 2, -chord)
+            light = (stop - start).clamp_min(0)
+        pixels = light.reshape(len(side), FINE, len(side), FINE).sum((1, 3))
+        pixels = pixels / pixels.sum()
+        top, left = max(y - reach, 0), max(x - reach, 0)
+        bottom, right = min(y + reach + 1, height), min(x + reach + 1, width)
+        piece = pixels[top - y + reach : bottom - y + reach, left - x + reach : right - x + reach]
+        out[n, :, top:bottom, left:right] += values[n, :, y, x, None, None] * piece
+    return out

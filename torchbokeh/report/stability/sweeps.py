@@ -1,0 +1,133 @@
+"""Radii and depths that change by a little: the picture changes by a little, across levels and changes of the plan."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from torchbokeh.lens import ThinLens
+from torchbokeh.lens.dispersion import FEWEST, SEEN, Dispersion, Spectrum
+from torchbokeh.ops.merge import FADE, STEPS
+from torchbokeh.plan.quality import QUALITIES
+from torchbokeh.renderers.kernel_splatting import KernelSplatting
+from torchbokeh.renderers.lens_blur import LensBlur
+from torchbokeh.report.stability.bounds import lipschitz
+from torchbokeh.report.stability.cases import slope, texture
+from torchbokeh.report.stability.renderers import coverage
+from torchbokeh.report.stability.rows import Row, row
+
+STEP = 1 / STEPS
+"""Change of all radii in px: that of merged ones in cells, so that each step shows."""
+
+STEEPEST = 128.0
+"""How steeply a picture may change with what decides on its plan, as a share of its contrast per px.
+
+The splats of 1/2 px change by 16 per px, and where they thin out to a quarter of their density, by 64 (`lipschitz`);
+parts of a plan come in over half a pixel or more, the foreground over 1 px: 4 per px in all, on each of those.
+"""
+
+PARTS = 0.005
+"""Relative L1 that a picture may jump by where an approach is cut into one more part: stated, not derived."""
+
+
+def sweep_rows(side: int) -> Iterator[Row]:
+    """Even radii around 1/2 px, the FFT's first radius, and the borders of levels: no jump beyond the Lipschitz bound.
+
+    Merged radii are rounded to 1/64 of a cell, so that the picture moves in steps: the change of the radius counts as
+    one step more. Between two levels, whose pictures differ by no more than the contrast, a pixel passes within `FADE`.
+    """
+    image = texture(side, side)
+    contrast = float(image.max() - image.min())
+    for quality in QUALITIES:
+        blur, merging = KernelSplatting(quality=quality.name), quality.merging
+        radii = [0.5, 3.0, 8.0]
+        if merging is not None:
+            radii += [2 * merging.cells, 2 * merging.cells * (1 + FADE), 4 * merging.cells]
+        for radius in dict.fromkeys(radii):
+            coc = slope(side, side, radius, radius)
+            near = [blur(image, coc + k * STEP) for k in (-2, -1, 0, 1, 2)]
+            change = max(float((b - a).abs().max()) for a, b in pairwise(near))
+            step = STEP
+            fade = 0.0
+            if merging is not None:
+                level = max(radius / merging.cells, 1.0)
+                step += level / STEPS
+                fade = STEP / (FADE * merging.cells * level) * contrast
+            limit = lipschitz(contrast, radius, float(coverage(coc).min())) * step + fade
+            case = f"sweep: {radius:.4g} px, in steps of 1/{STEPS} px"
+            yield row(f"KernelSplatting, {quality.name}", case, "float64", "largest change", change, limit)
+
+
+def plan_rows(side: int, width: float = 1e-5) -> Iterator[Row]:
+    """By how much a picture changes where its plan does, over twice that width in px, at the worst pixel.
+
+    Where a plan takes up one more part, the pictures with and without it are mixed, so that nothing jumps. What is left
+    is the number of parts that an exposure is cut into, as relative L1.
+
+    Args:
+        side: of the pictures in px.
+        width: see above.
+    """
+    image, ramp = texture(side, side), slope(side, side, 0.0, 1.0)
+    edge = (torch.arange(side) > side // 2).double().expand(1, 1, side, side)
+    way = torch.tensor([0.6, 0.8], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, side, side)
+    behind = texture(side, side, seed=3)
+    layers = torch.stack([torch.cat([image * edge, edge], 1), torch.cat([behind, torch.ones_like(edge)], 1)], 1)
+    changes: dict[str, Callable[[LensBlur, float], Tensor]] = {
+        "sharp, or not": lambda blur, s: blur(image, coc=0.5 + s - 0.7 * edge),
+        "one radius, or several": lambda blur, s: blur(image, coc=10 + max(s, 0.0) * ramp),
+        "foreground appears at -1 px": lambda blur, s: blur(image, coc=-1 + s + 5 * ramp),
+        "foreground appears at a range of 1 px": lambda blur, s: blur(image, coc=-1.5 + (1 + s) * ramp),
+        "rest appears at -2 px": lambda blur, s: blur(image, coc=-7 + (5 + s) * edge),
+        "foreground over a known background": lambda blur, s: blur(image, coc=-1 + s + 5 * ramp, background=behind),
+        "one bin, or two": lambda blur, s: blur(image, coc=4 + (1 + s) * ramp),
+        "two bins, or three": lambda blur, s: blur(image, coc=4 + (6 + s) * ramp),
+        "sub-apertures from 3 px": lambda blur, s: blur(image, coc=-2 + (5 + s) * ramp),
+        "sub-apertures from 3 px, at an edge": lambda blur, s: blur(image, coc=-2 + (5 + s) * edge),
+        "sub-apertures of layers": lambda blur, s: blur(layers, coc=torch.stack([-3 + s - edge * 0, 2 * edge], 1)),
+        "motion from 0.5 px": lambda blur, s: blur(image, coc=-6 + 10 * ramp, motion=(0.5 + s) * way),
+        "approach from 0.5 px": lambda blur, s: blur(
+            image, coc=-6 + 10 * ramp, shutter_depth=_ends(-6 + 10 * ramp, 0.5 + s)
+        ),
+    }
+    borders: tuple[tuple[Spectrum, float], ...] = ("rgb", SEEN), ("continuous", SEEN), ("continuous", FEWEST + 1.0)
+    for quality in QUALITIES:
+        blur = LensBlur(quality=quality.name)
+        for name, picture in changes.items():
+            worst = float((picture(blur, -width) - picture(blur, width)).abs().max())
+            limit = 2 * width * STEEPEST * float(image.max() - image.min())
+            case = f"change of plan: {name}"
+            yield row(f"LensBlur image, {quality.name}", case, "float64", "largest change", worst, limit)
+        for spectrum, border in borders:
+            yield _colour_row(blur, image, 3.3 + 3 * ramp, spectrum, border)
+        coc = 8 + 4 * ramp
+        before, after = (blur(image, coc=coc, shutter_depth=_ends(coc, 4 + s)) for s in (-width, width))
+        jump = float((before - after).abs().sum() / before.abs().sum())
+        case = "change of plan: two parts of an approach, or three"
+        yield row(f"LensBlur image, {quality.name}", case, "float64", "relative L1 jump", jump, PARTS, stated=True)
+
+
+def _ends(coc: Tensor, change: float) -> Tensor:
+    """CoC when the shutter opens and when it closes."""
+    return torch.cat([coc - change / 2, coc + change / 2], 1)
+
+
+def _colour_row(blur: LensBlur, image: Tensor, depth: Tensor, spectrum: Spectrum, border: float) -> Row:
+    """How much a picture changes where its colours spread by that many px."""
+
+    def with_axial(strength: float) -> LensBlur:
+        lens = ThinLens(0.05, 0.1, 2.0, 0.036, dispersion=Dispersion("BK7", axial=strength, spectrum=spectrum))
+        return LensBlur(lens, quality=blur.quality)
+
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        spread = with_axial(middle).plan(image, depth).spread
+        low, high = (middle, high) if spread < border else (low, middle)
+    width = 1e-5
+    before, after = (with_axial(high * (1 + s))(image, depth) for s in (-width, width))
+    limit = 2 * width * border * STEEPEST * float(image.max() - image.min())
+    case = f"change of plan: {spectrum} colours from {border:g} px"
+    worst = float((before - after).abs().max())
+    return row(f"LensBlur image, {blur.quality}", case, "float64", "largest change", worst, limit)

@@ -1,0 +1,1 @@
+"""Many views through the lens while the shutter is open."""

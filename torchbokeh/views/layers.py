@@ -1,0 +1,150 @@
+"""Many views of layers: each is warped by the parallax of its own pixels."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchbokeh.compose.surfaces import continued
+from torchbokeh.lens.field_map import Field
+from torchbokeh.ops.planes import pixel_centres
+from torchbokeh.ops.raycast import subsample_blur
+from torchbokeh.views.points import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
+from torchbokeh.views.prism import Prism
+
+STEPS = 4
+"""Steps to the point that a view moves to a pixel; each leaves an error smaller by the slope of the parallax."""
+
+LEVELS = 8
+
+
+class Layer:
+    """One layer, ready to be warped into views.
+
+    Args:
+        rgba: ``(B, 4, H, W)`` premultiplied.
+        coc: ``(B, 1, H, W)`` signed, px.
+        motion: ``(B, 2, H, W)`` px over the open shutter, or ``None``.
+        levels: how many levels of detail are needed.
+    """
+
+    def __init__(self, rgba: Tensor, coc: Tensor, motion: Tensor | None, levels: int) -> None:
+        alpha = rgba[:, 3:]
+        parts = [continued(coc, alpha)]
+        if motion is not None:
+            parts += [continued(motion[:, c : c + 1], alpha) for c in (0, 1)]
+        self.field = torch.cat(parts, 1)
+        self.even = bool((self.field.detach().amax((2, 3)) - self.field.detach().amin((2, 3)) < 1e-3).all())
+        self.levels = [rgba]
+        while len(self.levels) < levels and max(self.levels[-1].shape[2:]) > 1:
+            odd = (0, self.levels[-1].shape[3] % 2, 0, self.levels[-1].shape[2] % 2)
+            self.levels.append(F.avg_pool2d(F.pad(self.levels[-1], odd, mode="replicate"), 2))
+
+    def view(self, lens: Tensor, time: float, level: int, more: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The layer as one view has it: RGBA ``(B, 4, H, W)`` and its signed CoC ``(B, 1, H, W)``.
+
+        ``more (2, H, W)`` is how far in px it moves pixels beside.
+        """
+        h, w = self.field.shape[2:]
+        x, y = pixel_centres((h, w), self.field)
+        pixel = torch.stack([x, y], -1).expand(len(self.field), h, w, 2)
+        moves = self.field
+        if more is not None:
+            moves = torch.cat([self.field, more.to(self.field).expand(len(self.field), -1, -1, -1)], 1)
+        here, field = pixel, moves
+        # The point that comes to lie on a pixel solves `here + parallax(here) = pixel`.
+        for _ in range(1 if self.even and more is None else STEPS):
+            move = field[:, :1] * lens[:, None, None]
+            if self.field.shape[1] == 3:
+                move = move + field[:, 1:3] * time
+            if more is not None:
+                move = move + field[:, -2:]
+            here = pixel - move.movedim(1, -1)
+            field = _at(moves, here, 1)
+        return _at(self.levels[level], here, 2**level), field[:, :1]
+
+
+def _at(image: Tensor, place: Tensor, texel: int) -> Tensor:
+    """Bilinear look-up at ``(B, H, W, 2)`` places (x, y) in px of an image whose pixels are ``texel`` px wide."""
+    extent = place.new_tensor([image.shape[3], image.shape[2]]) * texel
+    return F.grid_sample(image, 2 * place / extent - 1, padding_mode="border", align_corners=False)
+
+
+def accumulate_layers(
+    layers: Tensor,
+    coc: Tensor,
+    motion: Tensor | None,
+    views: Views,
+    prism: Prism | None = None,
+    *,
+    level_of_detail: float,
+    reuse: int,
+    subsamples: int,
+) -> Tensor:
+    """The mean of the views ``(B, 4, H, W)``, or their sum in the colours of a prism.
+
+    See `torchbokeh.AccumulationBuffer` and `torchbokeh.ChromaticAccumulation`.
+    """
+    b, count, _, h, w = layers.shape
+    if layers.numel() == 0:
+        return layers.new_zeros(b, 4, h, w)
+    if b > 1 and (level_of_detail or reuse):  # what an item may share or leave out does not depend on the others
+        moved = [None] * b if motion is None else motion.split(1)
+        settings: dict[str, Any] = {"level_of_detail": level_of_detail, "reuse": reuse, "subsamples": subsamples}
+        each = zip(layers.split(1), coc.split(1), moved, strict=True)
+        return torch.cat([accumulate_layers(*one, views, prism, **settings) for one in each])
+    points = views.lens if prism is None else views.lens.unique(dim=0)  # wavelengths share points
+    offsets, scale = subsample_offsets(points, subsamples)
+    # The pixels of the input are means already: shifting them would only blur them once more.
+    views = Views(views.lens * scale, views.time, torch.zeros_like(views.shift))
+    with torch.no_grad():
+        held = layers[:, :, 3:] > 0
+        low = torch.where(held, coc, torch.inf).movedim(1, 0).flatten(1).amin(1).double().cpu()
+        high = torch.where(held, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1).double().cpu()
+        speed = torch.zeros_like(low)
+        if motion is not None:
+            speed = (motion.norm(dim=2, keepdim=True) * held).movedim(1, 0).flatten(1).amax(1).double().cpu()
+    kept = [k for k in range(count) if low[k] <= high[k]]
+    low, high, speed = low[kept], high[kept], speed[kept]
+    level = torch.zeros(len(views), len(kept), dtype=torch.long)
+    if level_of_detail:
+        most = torch.full_like(low, min(LEVELS, max(layers.shape[3:]).bit_length()) - 1)
+        below, above = (0.0, 0.0) if prism is None else prism.shifts()
+        radius = smallest_radius(low + below, high + above)
+        level = detail_levels(radius, torch.ones_like(low), level_of_detail, len(views), most)
+    parents = torch.arange(len(views))[:, None].expand_as(level)
+    if reuse:
+        # Only views of one wavelength move a layer alike.
+        kinds = level if prism is None else level + (LEVELS + 1) * prism.kinds()[:, None]
+        parents = shared_views(views, largest_coc(low, high), speed, reuse, kinds)
+    ready = [
+        Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
+        for i, k in enumerate(kept)
+    ]
+    last = {(i, p): v for v, row in enumerate(parents.tolist()) for i, p in enumerate(row)}
+    copies: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+    total = torch.zeros_like(layers[:, 0])
+    field = Field.pixels((h, w), 0, coc)
+    for v in range(len(views)):
+        left = torch.ones_like(total[:, 3:])
+        picture, front, most_seen = torch.zeros_like(total), torch.zeros_like(left), torch.zeros_like(left)
+        for i, layer in enumerate(ready):
+            key = (i, int(parents[v, i]))
+            if key not in copies:
+                point = views.lens[key[1]].to(layers)
+                more = None if prism is None else prism.movement(key[1], point, field)
+                copies[key] = layer.view(point, float(views.time[key[1]]), int(level[key[1], i]), more)
+            rgba, radius = copies[key]
+            if last[key] == v:
+                del copies[key]
+            picture = picture + left * rgba
+            if subsamples:
+                visible = left * rgba[:, 3:]
+                # Where nothing is seen, the last layer stands for it: no surface in focus that hides what is blurred
+                front = torch.where(visible >= most_seen, radius, front)
+                most_seen = torch.maximum(most_seen, visible)
+            left = left * (1 - rgba[:, 3:])
+        picture = subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture
+        total = total + (picture if prism is None else picture * prism.weights[v].to(picture)[:, None, None])
+    return total / len(views) if prism is None else total
