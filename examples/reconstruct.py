@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 import torchbokeh as tb
+from torchbokeh import reconstruct
 from torchbokeh.io.pictures import write_image
-from torchbokeh.renderers.reconstruction import reconstruct
 from torchbokeh.report.measure import errors
 from torchbokeh.report.motion.experiments import non_local_means
 from torchbokeh.scenes import samples

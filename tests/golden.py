@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh.learn.augmentation import RandomLensBlur
+from torchbokeh.augmentation import RandomLensBlur
 
 QUALITIES = ("exact", "high", "balanced", "fast")
 

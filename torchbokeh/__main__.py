@@ -2,7 +2,7 @@
 
 import sys
 
-from torchbokeh.commands.main import main
+from torchbokeh.commands.entry import main
 
 if __name__ == "__main__":
     sys.exit(main())

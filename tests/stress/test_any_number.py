@@ -55,7 +55,7 @@ def test_disparity_lenses(strength: float, focus_disparity: float) -> None:
 def test_dispersions(axial: float, lateral: float, reference: float) -> None:
     dispersion = made(tb.Dispersion, axial=axial, lateral=lateral, reference=reference)
     if dispersion is not None:
-        field = tb.field_map.Field.pixels((4, 6), 0, torch.zeros(()))
+        field = tb.lens.Field.pixels((4, 6), 0, torch.zeros(()))
         lens = tb.ThinLens(0.05, 2.0, 2.0, 0.036, dispersion=dispersion)
         for wavelength in (475.0, 650.0):
             assert lens.coc_shift(wavelength, 640, field).isfinite().all()

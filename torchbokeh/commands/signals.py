@@ -2,24 +2,14 @@
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 
 
 class Terminated(BaseException):
     """SIGTERM came; what is at work unwinds as it does on Ctrl-C."""
-
-
-def is_command() -> bool:
-    """Whether this process is the command line, a console script or by ``-m``, and not only uses the library."""
-    program, *flags = getattr(sys, "argv", None) or [""]
-    if program == "-m":  # a package that -m names is imported before its name takes this place
-        return sys.orig_argv[: len(sys.orig_argv) - len(flags)][-1] == "torchbokeh"
-    return Path(program).stem == "torchbokeh"
 
 
 def end_while_importing() -> None:

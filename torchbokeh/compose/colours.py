@@ -1,163 +1,101 @@
-"""A picture blurred light by light: each wavelength with its own radius and magnification, from one pinhole picture."""
-
-from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple
+"""A picture in the light of one wavelength: with its own radius and magnification, from one pinhole picture."""
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.compose.surfaces import continued
-from torchbokeh.lens import Lens
-from torchbokeh.lens.dispersion import SEEN
+from torchbokeh.lens.base import Lens
 from torchbokeh.lens.field_map import Field
-from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.picture.motion import Motion, ways
-from torchbokeh.plan.decide import Look, Moves, Wishes, decide, passed
-from torchbokeh.plan.plan import Colour, Plan
-
-STEPS = 4
-"""Steps to the place that comes to lie on a pixel; each leaves an error smaller by the slope of the magnification."""
+from torchbokeh.picture.request import Optics, Request
+from torchbokeh.picture.sensor import STEPS
+from torchbokeh.plan.plan import Colour
 
 
-class Given(NamedTuple):
-    """What a picture is blurred by, see `torchbokeh.LensBlur.forward`.
-
-    Attributes:
-        image: ``(B, C, H, W)`` or layers ``(B, L, 4, H, W)``; with fewer channels of colour where that is of one light.
-        signed: its signed CoC in px.
-        motion: of it.
-        ends: signed CoC when the shutter opens and closes.
-        behind: what the foreground hides, as colour and signed CoC.
-    """
-
-    image: Tensor
-    signed: Tensor
-    motion: Motion
-    ends: Tensor | None
-    behind: tuple[Tensor, Tensor | None] | None
+def channels_of(colour: Colour) -> list[int]:
+    """The channels of a picture that a light adds to."""
+    return [c for c in range(3) if colour.light.rgb[c] > 0]
 
 
-@torch.no_grad()
-def plan_colours(
-    plan: Plan, look: Look, moves: Moves, wishes: Wishes, lens: Lens, like: Tensor, *, margin: int, limit: float | None
-) -> Plan:
-    """The same plan, with one for each light that the lens splits a picture into."""
-    dispersion = lens.dispersion
-    if dispersion is None:
-        return plan
-    like = like[..., :1].to(compute_dtype(like))
-    field, width = Field.pixels(look.size, margin, like), look.size[1] - 2 * margin
-    first, last = dispersion.wavelengths()
-    shifts = lens.coc_shift(first, width, field) - lens.coc_shift(last, width, field)
-    scale = dispersion.enlargement(first, field) - dispersion.enlargement(last, field)
-    away = (scale * torch.hypot(field.x, field.y)).abs().max()
-    spread, sideways = torch.stack([shifts.abs().max().to(away), away]).tolist()
-    learned = dispersion.axial.requires_grad or dispersion.lateral.requires_grad
-    seen = max(spread + sideways, 1.0 if learned else 0.0)
-    light = dispersion.light(seen)
-    if not light:
-        return plan
-    enlarged = sideways > 0 or dispersion.lateral.requires_grad
-    found = [torch.stack(lens.coc_shift(one.wavelength, width, field).aminmax()) for one in light]
-
-    def cut(values: tuple[float, ...], by: float) -> tuple[float, ...]:
-        moved = (v + by for v in values)
-        return tuple(moved) if limit is None else tuple(min(max(v, -limit), limit) for v in moved)
-
-    colours = []
-    for one, (low, high) in zip(light, torch.stack(found).tolist(), strict=True):
-        own = look._replace(low=cut(look.low, low), high=cut(look.high, high))
-        colours.append(Colour(one, enlarged, decide(own, moves, wishes)))
-    plain = 1 - passed(seen, (SEEN, 2 * SEEN))
-    fading = ((plan, plain),) if plain > 0 else ()
-    return replace(plan, colours=tuple(colours), spread=spread + sideways, fading=fading)
-
-
-def blur_colours(
-    given: Given, plan: Plan, lens: Lens, blur: Callable[[Given, Plan], Tensor], *, margin: int, limit: float | None
-) -> Tensor:
-    """The sum of the pictures that the lens makes of every light.
+def in_light(request: Request, colour: Colour, optics: Optics) -> Request:
+    """The channels of a picture, with the radii and in the size that they have in light of one wavelength.
 
     Args:
-        given: the picture and its maps.
-        plan: with its colours.
-        lens: with a dispersion.
-        blur: makes the picture of one light, ``(B, C, H, W)``, or ``(B, C + 1, H, W)`` of layers.
-        margin: px on each side that lie beyond the sensor.
-        limit: largest radius in px.
+        request: the picture, in at least float32.
+        colour: the light.
+        optics: with a lens that has a dispersion.
     """
-    given = _working(given)
-    layered = given.image.dim() == 5
-    field = Field.pixels(plan.size, margin, given.signed)
-    out = [torch.zeros_like(given.signed if not layered else given.signed[:, 0])] * (4 if layered else 3)
-    for light, enlarged, own in plan.colours:
-        channels = [c for c in range(3) if light.rgb[c] > 0]
-        part = blur(_of_light(given, light.wavelength, channels, lens, field, margin, limit, enlarged), own)
-        for k, c in enumerate(channels):
-            out[c] = out[c] + light.rgb[c] * part[:, k : k + 1]
-        if layered:
-            out[3] = out[3] + sum(light.rgb) / 3 * part[:, -1:]
-    return torch.cat(out, 1)
-
-
-def _working(given: Given) -> Given:
-    """The same in at least float32: half precision can tell neither radii nor the columns of a wide picture apart."""
-    image, signed, motion, ends, behind = given
-    dtype = compute_dtype(image, signed)
-
-    def of(t: Tensor | None) -> Tensor | None:
-        return None if t is None else t.to(dtype)
-
-    if behind is not None:
-        behind = behind[0].to(dtype), of(behind[1])
-    moved = None if motion is None else [way.to(dtype) for way in ways(motion)]
-    return Given(image.to(dtype), signed.to(dtype), moved, of(ends), behind)
-
-
-def _of_light(
-    given: Given,
-    wavelength: float,
-    channels: list[int],
-    lens: Lens,
-    field: Field,
-    margin: int,
-    limit: float | None,
-    enlarged: bool,
-) -> Given:
-    """The channels of a picture, with the radii and in the size that they have in light of one wavelength."""
-    shift = lens.coc_shift(wavelength, field.x.shape[1] - 2 * margin, field)
+    lens, limit, sensor = optics.lens, optics.max_coc, request.sensor
+    assert lens is not None
+    wavelength, field = colour.light.wavelength, sensor.field(request.coc)
+    shift = lens.coc_shift(wavelength, sensor.width, field)
 
     def shifted(coc: Tensor) -> Tensor:
         moved = coc + (shift[:, None] if coc.dim() == 5 and shift.dim() == 4 else shift).to(coc.dtype)
         return moved if limit is None else moved.clamp(-limit, limit)
 
-    image = given.image.index_select(-3, torch.tensor(channels, device=given.image.device))
-    if given.image.dim() == 5:
-        image = torch.cat([image, given.image[:, :, 3:]], 2)
+    channels = channels_of(colour)
+    image = request.image.index_select(-3, torch.tensor(channels, device=request.image.device))
+    if request.layered:
+        image = torch.cat([image, request.image[:, :, 3:]], 2)
     behind = None
-    if given.behind is not None:
-        colour, coc = given.behind
-        behind = colour[:, channels], None if coc is None else shifted(coc)
-    ends = None if given.ends is None else shifted(given.ends)
-    one = Given(image, shifted(given.signed), given.motion, ends, behind)
-    return _enlarged(one, wavelength, lens, field, margin) if enlarged else one
+    if request.background is not None:
+        picture, coc = request.background
+        behind = picture[:, channels], None if coc is None else shifted(coc)
+    motion, ends = request.motion, request.motion.shutter_coc
+    motion = motion if ends is None else motion._replace(shutter_coc=shifted(ends))
+    one = request._replace(image=image, coc=shifted(request.coc), motion=motion, background=behind)
+    return _enlarged(one, wavelength, lens, field) if colour.enlarged else one
 
 
-def _enlarged(given: Given, wavelength: float, lens: Lens, field: Field, margin: int) -> Given:
+class Mixture:
+    """A sum of pictures, each of all light or of one wavelength, channel by channel."""
+
+    def __init__(self) -> None:
+        self._whole: Tensor | None = None
+        self._channels: list[Tensor | None] = [None, None, None, None]
+
+    def add(self, part: Tensor, colour: Colour | None, share: float, *, layered: bool) -> None:
+        """Add a picture.
+
+        Args:
+            part: ``(B, C, H, W)``; of one light, the channels of `channels_of`, and last the coverage of layers.
+            colour: the light that it is of; None for all of it.
+            share: how much it counts for.
+            layered: whether its last channel is a coverage.
+        """
+        if colour is None:
+            weighted = part if share == 1 else share * part
+            self._whole = weighted if self._whole is None else self._whole + weighted
+            return
+        rgb = colour.light.rgb
+        weights = {c: (k, rgb[c]) for k, c in enumerate(channels_of(colour))}
+        if layered:
+            weights[3] = part.shape[1] - 1, sum(rgb) / 3
+        for c, (k, weight) in weights.items():
+            one, sum_of_others = share * weight * part[:, k : k + 1], self._channels[c]
+            self._channels[c] = one if sum_of_others is None else sum_of_others + one
+
+    def total(self) -> Tensor:
+        """The sum ``(B, C, H, W)``."""
+        channels = [c for c in self._channels if c is not None]
+        if not channels:
+            assert self._whole is not None
+            return self._whole
+        coloured = torch.cat(channels, 1)
+        return coloured if self._whole is None else coloured + self._whole
+
+
+def _enlarged(request: Request, wavelength: float, lens: Lens, field: Field) -> Request:
     assert lens.dispersion is not None
-    height, width = field.x.shape
-    sensor = height - 2 * margin, width - 2 * margin
+    height, width = request.sensor.size
     here = field
     for _ in range(STEPS):
         scale = 1 + lens.dispersion.enlargement(wavelength, here)
-        here = Field.of(field.x / scale, field.y / scale, sensor)
+        here = Field(field.x / scale, field.y / scale, request.sensor.inner)
     grid = torch.stack([2 * here.x / width, 2 * here.y / height], -1)
-    batch = len(given.image)
-    grid = grid.reshape(-1, height, width, 2).expand(batch, -1, -1, -1)
-
-    alpha = given.image[:, :, -1:].flatten(0, 1) if given.image.dim() == 5 else None
+    grid = grid.reshape(-1, height, width, 2).expand(len(request.image), -1, -1, -1)
+    alpha = request.image[:, :, -1:].flatten(0, 1) if request.layered else None
 
     def at(t: Tensor, mode: str = "nearest") -> Tensor:
         if alpha is not None and mode == "nearest":  # the rim of a layer takes its maps along
@@ -165,10 +103,11 @@ def _enlarged(given: Given, wavelength: float, lens: Lens, field: Field, margin:
         flat = t.flatten(1, -3)
         return F.grid_sample(flat, grid.to(t.dtype), mode=mode, padding_mode="border", align_corners=False).view_as(t)
 
-    ends = None if given.ends is None else at(given.ends)
     behind = None
-    if given.behind is not None:
-        colour, coc = given.behind
+    if request.background is not None:
+        colour, coc = request.background
         behind = at(colour, "bilinear"), None if coc is None else at(coc)
-    moved = [at(way) for way in ways(given.motion)]
-    return Given(at(given.image, "bilinear"), at(given.signed), moved or None, ends, behind)
+    motion, ends = request.motion, request.motion.shutter_coc
+    moved = tuple(at(d) for d in motion.displacements)
+    motion = motion._replace(displacements=moved, shutter_coc=None if ends is None else at(ends))
+    return request._replace(image=at(request.image, "bilinear"), coc=at(request.coc), motion=motion, background=behind)

@@ -131,7 +131,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             seen[key] = _filled(seen[key], self.layers, empty)
         for key in ("alpha", "shutter_depth", "layer_shutter_depth"):
             del seen[key]
-        lens = {key: value.clone() for key, value in camera.lens._values().items()}
+        lens = {key: value.clone() for key, value in camera.lens.values().items()}
         coc = camera.lens.coc(seen["depth"], self.resolution[1])
         return {**seen, "coc": coc, "target": target, "lens": lens, "recipe": name, "index": index}
 

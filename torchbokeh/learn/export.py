@@ -16,11 +16,11 @@ from torchbokeh.learn.integration import FFTIntegrator, Integrator, PyramidInteg
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.ops.checks import check_image
 from torchbokeh.ops.dispatch import definitions_only
-from torchbokeh.ops.spans import subdivide
 from torchbokeh.ops.system.files import replacing
-from torchbokeh.plan.plan import Plan
-from torchbokeh.renderers.kernel_splatting import KernelSplatting, SplattingPlan, blur_one_layer
+from torchbokeh.plan.plan import Plan, SplattingPlan
+from torchbokeh.renderers.kernel_splatting import KernelSplatting
 from torchbokeh.renderers.lens_blur import LensBlur
+from torchbokeh.renderers.planned import Planned, fitting
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -99,44 +99,18 @@ class _Traced(NamedTuple):
     margin: int = 0
 
 
-class _Blur(nn.Module):
-    """A `LensBlur` that carries out one plan."""
-
-    def __init__(self, blur: LensBlur, plan: Plan) -> None:
-        super().__init__()
-        self.blur, self.plan = blur, plan
-        # Shapes of apertures are made by sorting and searching; they are constants here.
-        profile = blur.aperture.profile()
-        self.pieces = {count: subdivide(profile, count) for count in plan.cuts}
-
-    def forward(self, image: Tensor, depth: Tensor) -> Tensor:
-        depth_map, coc = (None, depth) if self.blur.lens is None else (depth, None)
-        given, _ = self.blur._inputs(image, depth_map, coc, (None, None), None)
-        return self.blur._cropped(self.blur._blur(given, self.plan, self.pieces))
-
-
-class _Splatting(nn.Module):
-    """A `KernelSplatting` that carries out one plan."""
-
-    def __init__(self, splatting: KernelSplatting, plan: SplattingPlan) -> None:
-        super().__init__()
-        self.profile, self.plan = splatting.aperture.profile(), plan
-
-    def forward(self, image: Tensor, coc: Tensor) -> Tensor:
-        return blur_one_layer(image, coc, self.profile, self.plan.quality.merging, self.plan.highest)
-
-
 class _Call(nn.Module):
     """A module as a function of its inputs and, after those, of parameters of its lens."""
 
-    def __init__(self, module: nn.Module, names: Sequence[str]) -> None:
+    def __init__(self, module: nn.Module, names: Sequence[str] = (), map_name: str = "") -> None:
         super().__init__()
-        self.module, self.names = module, names
+        self.module, self.names, self.map_name = module, names, map_name
 
     def forward(self, *given: Tensor) -> Tensor:
         count = len(given) - len(self.names)
-        lens = {f"blur.lens.{name}": value for name, value in zip(self.names, given[count:], strict=True)}
-        return torch.func.functional_call(self.module, lens, given[:count])
+        first, maps = given[:1], dict(zip([self.map_name], given[1:count], strict=False))
+        lens = {f"renderer.lens.{name}": value for name, value in zip(self.names, given[count:], strict=True)}
+        return torch.func.functional_call(self.module, lens, first, maps)
 
 
 def _integrator(module: Integrator, inputs: tuple[Tensor, ...], plan: object) -> _Traced:
@@ -148,7 +122,7 @@ def _integrator(module: Integrator, inputs: tuple[Tensor, ...], plan: object) ->
     if isinstance(module, PyramidIntegrator) and module.levels is None:
         module = copy(module)
         module.levels = (max(*inputs[0].shape[-2:], 1) - 1).bit_length() + 1
-    return _Traced(_Call(module, ()), inputs, ("buffer",), "image")
+    return _Traced(_Call(module), inputs, ("buffer",), "image")
 
 
 def _renderer(module: LensBlur | KernelSplatting, inputs: tuple[Tensor, ...], plan: object) -> _Traced:
@@ -156,29 +130,20 @@ def _renderer(module: LensBlur | KernelSplatting, inputs: tuple[Tensor, ...], pl
         raise ValueError(f"inputs: expected an image and its depth or CoC, got {len(inputs)} tensors")
     if isinstance(module, KernelSplatting) and module.bank is not None:
         raise ValueError("module: expected a KernelSplatting without a bank, got one with a bank")
-    lens = module.lens if isinstance(module, LensBlur) else None
+    lens, margin = (module.lens, module.margin) if isinstance(module, LensBlur) else (None, 0)
     name = "coc" if lens is None else "depth"
-    made = module.plan(inputs[0], **{name: inputs[1]})
-    plan = made if plan is None else plan
-    if not isinstance(plan, type(made)):
-        raise TypeError(f"plan: expected a {type(made).__name__} or None, got {type(plan).__name__}")
-    if plan.sharp or plan.uniform is not None:
+    request = module.request(inputs[0], **{name: inputs[1]})
+    found: Plan | SplattingPlan = module.decide(request)
+    if plan is not None:
+        found = fitting(plan, type(found), request)
+    if found.sharp or found.uniform is not None:
         raise ValueError("plan: expected one of a scene whose blur varies, got one that leaves the splatting out")
-    if isinstance(plan, Plan) and (plan.colours or plan.moves):
+    if isinstance(found, Plan) and (found.colours or found.moves):
         raise ValueError("plan: expected one without dispersion and motion, which are not exported, got one with them")
-    bare: nn.Module
-    margin = 0
-    if isinstance(module, LensBlur):
-        assert isinstance(plan, Plan)
-        depth_map, coc = (None, inputs[1]) if lens is None else (inputs[1], None)
-        module._check_plan(plan, module._inputs(inputs[0], depth_map, coc, (None, None), None)[0])
-        bare, margin = _Blur(module, plan), module.margin
-    else:
-        assert isinstance(plan, SplattingPlan)
-        bare = _Splatting(module, plan)
     names = next((given for kind, given in INPUTS.items() if isinstance(lens, kind)), ())
-    values = (getattr(lens, name).detach() for name in names)
-    return _Traced(_Call(bare, names), (*inputs, *values), ("image", name, *names), "blurred", margin)
+    values = (getattr(lens, parameter).detach() for parameter in names)
+    call = _Call(Planned(module, found), names, name)
+    return _Traced(call, (*inputs, *values), ("image", name, *names), "blurred", margin)
 
 
 def _translated(traced: _Traced) -> "ModelProto":

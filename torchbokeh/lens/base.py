@@ -1,25 +1,20 @@
-"""Lenses: from depth, or disparity, to the signed circle of confusion (CoC) and back."""
+"""What every lens is: depth, or disparity, to the signed circle of confusion (CoC) and back."""
 
-import math
 from abc import ABC, abstractmethod
-from numbers import Real
 
 import torch
 from torch import Tensor
 
 from torchbokeh.lens.dispersion import Dispersion
 from torchbokeh.lens.field_map import Field
-from torchbokeh.lens.parameters import Held, check_parameter
-
-RANGES = {"focal_length": (1e-6, 1e4), "f_number": (1e-6, 1e12), "sensor_width": (1e-4, 1e4)}
-"""Parameters of a `ThinLens`: beyond these, radii would leave the range of float32."""
-
-NEAREST = 1e-9
-"""Metres: what is nearer counts as depth 0, whose radius is infinite."""
+from torchbokeh.lens.parameters import ParametricModule
 
 
-class Lens(Held, ABC):
+class Lens(ParametricModule, ABC):
     """What every lens can do: turn depth into a signed CoC radius in pixels, and back.
+
+    A lens of one's own is a subclass with :meth:`coc`, and with :meth:`depth` where anyone asks for the inverse; every
+    renderer takes it. ``examples/own_lens.py`` has one whose CoC depends on the place in the picture.
 
     A lens parameter is a scalar, or ``(B,)`` with one value for each item of the batch, the first dimension
     of the maps. Numbers and tensors are kept as buffers (float32 for numbers), so they follow ``.to()`` and
@@ -37,12 +32,19 @@ class Lens(Held, ABC):
         self.dispersion = None
 
     @abstractmethod
-    def coc(self, depth: Tensor, width: int) -> Tensor:
-        """Signed CoC radius in pixels, positive behind the focus plane; ``width`` is the image's."""
+    def coc(self, depth: Tensor, width: int, *, field: Field | None = None) -> Tensor:
+        """Signed CoC radius in pixels, positive behind the focus plane.
 
-    @abstractmethod
+        Args:
+            depth: ``(..., H, W)``, whatever the lens takes for depth.
+            width: of the sensor in pixels.
+            field: where the pixels are, from the middle of the sensor; renderers always pass it. A lens that needs it
+                says what it does without.
+        """
+
     def depth(self, coc: Tensor, width: int) -> Tensor:
         """Inverse of :meth:`coc`: the depth at which the signed CoC radius is ``coc`` pixels."""
+        raise NotImplementedError(f"{type(self).__name__} does not say which depth has a given circle of confusion")
 
     def coc_shift(self, wavelength: float, width: int, field: Field | None = None) -> Tensor:
         """How much larger the signed CoC radius of a wavelength is in px: 0 for a lens without dispersion."""
@@ -52,19 +54,29 @@ class Lens(Held, ABC):
         """Same as :meth:`coc`."""
         return self.coc(depth, width)
 
-    def _align(self, name: str, x: Tensor, width: int) -> list[Tensor]:
-        """Check a map and the image width; return the map and the parameters, all ready to broadcast."""
+    def aligned(self, name: str, x: Tensor, width: int) -> list[Tensor]:
+        """Check a map and the width; return the map and the lens's parameters, all ready to broadcast.
+
+        Args:
+            name: of the map, for messages.
+            x: the map ``(..., H, W)``.
+            width: of the sensor in pixels.
+
+        Raises:
+            TypeError: ``x`` is no floating-point tensor, or ``width`` no integer.
+            ValueError: a shape or device does not fit, or ``width`` < 1.
+        """
         if not isinstance(x, Tensor):
             raise TypeError(f"{name}: expected a tensor of shape (..., H, W), got {type(x).__name__}")
         if not x.is_floating_point():
             raise TypeError(f"{name}: expected a floating-point tensor, got {x.dtype}")
         if x.dim() < 2:
             raise ValueError(f"{name}: expected shape (..., H, W), got {tuple(x.shape)}")
-        _check_width(width)
+        check_width(width)
         # A map of less than float32 would lose the difference of two nearly equal reciprocals.
         dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
         out = [x.to(dtype)]
-        for value in self._values().values():
+        for value in self.values().values():
             if value.device != x.device:
                 raise ValueError(f"{name}: expected the lens's device {value.device}, got {x.device}")
             value = value.to(dtype)
@@ -78,349 +90,16 @@ class Lens(Held, ABC):
         return out
 
 
-class ThinLens(Lens):
-    """A thin lens: focal length, f-number, focus distance and sensor width say how large the blur is.
-
-    The CoC radius in pixels is, with ``E = focal_length / (2 * f_number)`` the radius of the aperture::
-
-        coc = E * F / (df - F) * (d - df) / d * width / sensor_width
-
-    positive behind the focus distance ``df``, negative before it. It is evaluated in reciprocal distances, as
-    ``E * F * (1/df - 1/d) / (1 - F/df)``, so ``d = inf`` (sky) and ``df = inf`` take their limits, and so do
-    the gradients.
-
-    Args:
-        focal_length: F, in metres, > 0, within `RANGES` as the f-number and the sensor width are.
-        f_number: N, > 0; the aperture is ``F / N`` wide.
-        focus_distance: df, in metres from the lens, > F; ``inf`` focuses on infinity.
-        sensor_width: in metres, > 0; the image's ``width`` pixels cover it.
-        dispersion: chromatic aberration; ``None`` for none.
-
-    Each but the last is a number, a 0-d or ``(B,)`` floating-point tensor, or an ``nn.Parameter``. Numbers are held in
-    float32; give float64 tensors where the last digits count.
-
-    Raises:
-        TypeError: not a number or floating-point tensor.
-        ValueError: out of its range, or shapes or devices that do not go together.
-
-    Source: the defocus equation (3.2) of the defocus and bokeh dissertation.
-
-    Example:
-        >>> import torch
-        >>> from torchbokeh.lens import ThinLens
-        >>> lens = ThinLens(focal_length=0.050, f_number=1.8, focus_distance=2.0, sensor_width=0.036)
-        >>> depth = torch.tensor([1.0, 2.0, torch.inf]).view(1, 1, 1, 3)
-        >>> [round(r, 2) for r in lens.coc(depth, width=1920).flatten().tolist()]
-        [-18.99, 0.0, 18.99]
-    """
-
-    focal_length: Tensor
-    f_number: Tensor
-    focus_distance: Tensor
-    sensor_width: Tensor
-
-    def __init__(
-        self,
-        focal_length: float | Tensor,
-        f_number: float | Tensor,
-        focus_distance: float | Tensor,
-        sensor_width: float | Tensor,
-        *,
-        dispersion: Dispersion | None = None,
-    ) -> None:
-        super().__init__()
-        self._hold(
-            focal_length=focal_length,
-            f_number=f_number,
-            focus_distance=focus_distance,
-            sensor_width=sensor_width,
-        )
-        for name, (low, high) in RANGES.items():
-            value = getattr(self, name)
-            check_parameter(name, value, (value > 0) & value.isfinite(), "a positive finite value")
-            check_parameter(name, value, (value >= low) & (value <= high), f"from {low:g} to {high:g}")
-        focus, focal = torch.broadcast_tensors(self.focus_distance, self.focal_length)
-        # Nearer to it by less, rounding would make the blur infinite.
-        beyond = (focus > focal) & (1 - focal.float() / focus.float() > 1e-6)
-        nearest = focal[~beyond][:1].tolist()
-        if nearest:
-            want = f"more than the focal length ({nearest[0]:g} m)"
-            check_parameter("focus_distance", focus, beyond, want)
-        if dispersion is not None and not isinstance(dispersion, Dispersion):
-            raise TypeError(f"dispersion: expected a Dispersion or None, got {type(dispersion).__name__}")
-        self.dispersion = dispersion
-
-    @property
-    def aperture_radius(self) -> Tensor:
-        """``E = focal_length / (2 * f_number)`` in metres, of the parameters' shape: scalar or ``(B,)``."""
-        return self.focal_length / (2 * self.f_number)
-
-    def coc(self, depth: Tensor, width: int) -> Tensor:
-        """Signed CoC radius in pixels, positive behind the focus distance.
-
-        Args:
-            depth: ``(B, 1, H, W)`` or ``(..., H, W)``, metres along the optical axis, > 0; ``inf`` is sky.
-            width: width of the whole image in pixels.
-
-        Returns:
-            The shape of ``depth``, float32 or float64. Finite at ``inf``, with gradient 0 to such a depth.
-
-        Raises:
-            TypeError: ``depth`` is no floating-point tensor, or ``width`` no integer.
-            ValueError: wrong shape or device, ``width`` < 1, or a depth <= 0 or NaN. Looking at the values
-                costs a device synchronisation and is left out in ``torch.compile`` and ``torch.export``.
-
-        Example:
-            >>> lens = ThinLens(0.050, 1.8, focus_distance=torch.inf, sensor_width=0.036)
-            >>> lens.coc(torch.full((1, 1, 2, 2), torch.inf), width=1920).abs().max().item()
-            0.0
-        """
-        d, f, n, df, sensor = self._align("depth", depth, width)
-        if not torch.compiler.is_compiling():
-            _check_map("depth", d, d >= NEAREST, "values above 0 (inf is sky)")
-        gain, focus = _optics(f, n, df, sensor, width)
-        # reciprocal(), not a quotient: its derivative, minus its own square, is 0 at inf and never NaN.
-        return gain * (focus - d.reciprocal())
-
-    def depth(self, coc: Tensor, width: int) -> Tensor:
-        """Depth in metres at which the signed CoC radius is ``coc``: the inverse of :meth:`coc`.
-
-        The CoC grows towards a limit as the depth goes to infinity. At that limit and beyond it the answer is
-        ``inf``, with gradient 0. NaN stays NaN.
-
-        Args:
-            coc: ``(B, 1, H, W)`` or ``(..., H, W)``, signed radius in pixels.
-            width: width of the whole image in pixels.
-
-        Returns:
-            The shape of ``coc``, float32 or float64.
-
-        Raises:
-            TypeError: ``coc`` is no floating-point tensor, or ``width`` no integer.
-            ValueError: wrong shape or device, or ``width`` < 1.
-
-        Example:
-            >>> lens = ThinLens(0.050, 1.8, focus_distance=2.0, sensor_width=0.036)
-            >>> lens.depth(torch.tensor([[0.0, 100.0]]), width=1920).tolist()
-            [[2.0, inf]]
-        """
-        c, f, n, df, sensor = self._align("coc", coc, width)
-        gain, focus = _optics(f, n, df, sensor, width)
-        # The same product as coc() forms at infinity, so that its limit comes back as exactly 1 / inf.
-        return _distance((gain * focus - c) / gain)
-
-    def coc_shift(self, wavelength: float, width: int, field: Field | None = None) -> Tensor:
-        """How much larger the signed CoC radius of a wavelength is than :meth:`coc`, in px, at every depth.
-
-        The sensor stays where it is, so ``1 / df(λ) = 1 / df + 1 / F(λ) - 1 / F``, which is (4.5) of the dissertation:
-        a sum of dioptres, whatever the depth. It needs no condition like (4.6): light that would be in focus beyond
-        infinity is blurred like any other.
-
-        Args:
-            wavelength: in nanometres.
-            width: width of the whole image in pixels.
-            field: where in the picture; ``None`` for the middle.
-
-        Returns:
-            Broadcasts with ``(B, 1, H, W)``; 0 without dispersion.
-
-        Example:
-            >>> lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=Dispersion("BK7", axial=0.5))
-            >>> round(lens.coc_shift(475.0, width=1920).item(), 2)
-            6.36
-        """
-        _check_width(width)
-        if self.dispersion is None:
-            return super().coc_shift(wavelength, width, field)
-        gain, _ = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
-        parts = gain / self.focal_length, self.dispersion.power(wavelength, field)
-        dioptres, power = (t.view(-1, 1, 1, 1) if t.dim() == 1 else t for t in parts)
-        return dioptres * power
-
-    def focus_at(self, wavelength: float) -> Tensor:
-        """Focus distance of a wavelength in metres, in the middle of the picture: (4.5) of the dissertation.
-
-        Raises:
-            ValueError: it lies beyond infinity: condition (4.6) fails.
-
-        Example:
-            >>> lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=Dispersion("BK7"))
-            >>> round(lens.focus_at(475.0).item(), 3)
-            1.194
-        """
-        power = torch.zeros(()) if self.dispersion is None else self.dispersion.power(wavelength)
-        nearness = self.focus_distance.reciprocal() + power / self.focal_length
-        if not bool((nearness > 0).all()):
-            raise ValueError(
-                f"wavelength: expected one that is in focus at a finite distance, got {wavelength:g} nm, whose focal "
-                f"length is too long; focus nearer than {(-self.focal_length / power).min().item():g} m, or take it "
-                "as the reference of the dispersion"
-            )
-        return nearness.reciprocal()
-
-    def hyperfocal(self, max_coc: float, width: int) -> Tensor:
-        """Shortest focus distance that keeps infinity sharp.
-
-        It is ``F * (1 + E * width / (sensor_width * max_coc))``, whatever the lens's own focus distance.
-        Focused there, the far limit is infinity and the near limit exactly half this distance.
-
-        Args:
-            max_coc: largest CoC radius in pixels that still counts as sharp, > 0.
-            width: width of the whole image in pixels.
-
-        Returns:
-            Metres, of the parameters' shape: scalar or ``(B,)``.
-
-        Raises:
-            TypeError: ``max_coc`` is no number, or ``width`` no integer.
-            ValueError: ``max_coc`` is not positive and finite, or ``width`` < 1.
-
-        Example:
-            >>> lens = ThinLens(0.050, 8.0, focus_distance=2.0, sensor_width=0.036)
-            >>> round(lens.hyperfocal(max_coc=0.5, width=1920).item(), 2)
-            16.72
-        """
-        _check_sharpness(max_coc, width)
-        return self.focal_length * (1 + self.aperture_radius * (width / max_coc) / self.sensor_width)
-
-    def near_limit(self, max_coc: float, width: int) -> Tensor:
-        """Nearest depth whose CoC radius is at most ``max_coc`` pixels; see :meth:`far_limit`."""
-        return self._limit(-1, max_coc, width)
-
-    def far_limit(self, max_coc: float, width: int) -> Tensor:
-        """Farthest depth whose CoC radius is at most ``max_coc`` pixels.
-
-        ``inf`` when the lens is focused at the hyperfocal distance or beyond.
-
-        Args, result and errors are those of :meth:`hyperfocal`.
-
-        Example:
-            >>> lens = ThinLens(0.050, 8.0, focus_distance=2.0, sensor_width=0.036)
-            >>> [round(limit(0.5, 1920).item(), 3) for limit in (lens.near_limit, lens.far_limit)]
-            [1.791, 2.265]
-        """
-        return self._limit(1, max_coc, width)
-
-    def _limit(self, side: int, max_coc: float, width: int) -> Tensor:
-        _check_sharpness(max_coc, width)
-        gain, focus = _optics(self.focal_length, self.f_number, self.focus_distance, self.sensor_width, width)
-        return _distance((gain * focus - side * max_coc) / gain)
-
-
-class DisparityLens(Lens):
-    """A lens for maps of disparity: ``coc = strength * (focus_disparity - disparity)``.
-
-    Disparity is larger for nearer things and may have any unit and offset, as from a stereo pair or a
-    network. Here the ``depth`` of the :class:`Lens` interface is that disparity, any finite value. With
-    ``disparity = a / depth`` it is the :class:`ThinLens` with ``focus_disparity = a / df`` and
-    ``strength = E * F / (1 - F / df) * width / sensor_width / a``.
-
-    Args:
-        strength: pixels of CoC radius per unit of disparity, finite; 0 blurs nothing and a negative one
-            takes larger values as farther.
-        focus_disparity: the disparity that is in focus, finite.
-
-    Each is given and held as for :class:`ThinLens`.
-
-    Raises:
-        TypeError: not a number or floating-point tensor.
-        ValueError: not finite, or shapes or devices that do not go together.
-
-    Example:
-        >>> import torch
-        >>> from torchbokeh.lens import DisparityLens
-        >>> lens = DisparityLens(strength=30.0, focus_disparity=0.5)
-        >>> lens.coc(torch.tensor([[0.0, 0.5, 1.0]]), width=1920).tolist()
-        [[15.0, 0.0, -15.0]]
-    """
-
-    strength: Tensor
-    focus_disparity: Tensor
-
-    def __init__(self, strength: float | Tensor, focus_disparity: float | Tensor) -> None:
-        super().__init__()
-        self._hold(strength=strength, focus_disparity=focus_disparity)
-        for name, value in self._values().items():
-            check_parameter(name, value, value.isfinite(), "a finite value")
-            check_parameter(name, value, value.abs() <= 1e18, "at most 1e18 in size")
-
-    def coc(self, depth: Tensor, width: int) -> Tensor:
-        """Signed CoC radius in pixels, positive behind the disparity in focus.
-
-        Args:
-            depth: disparity, ``(B, 1, H, W)`` or ``(..., H, W)``, finite.
-            width: width of the whole image in pixels; without effect on the result.
-
-        Returns:
-            The shape of ``depth``, float32 or float64.
-
-        Raises:
-            TypeError: ``depth`` is no floating-point tensor, or ``width`` no integer.
-            ValueError: wrong shape or device, ``width`` < 1, or a disparity infinite or NaN; the values are
-                looked at as in :meth:`ThinLens.coc`.
-        """
-        disparity, strength, focus = self._align("depth", depth, width)
-        coc = strength * (focus - disparity)
-        if not torch.compiler.is_compiling():
-            _check_map("depth", disparity, coc.isfinite(), "finite disparities")
-        return coc
-
-    def depth(self, coc: Tensor, width: int) -> Tensor:
-        """Disparity at which the signed CoC radius is ``coc``: the inverse of :meth:`coc`.
-
-        A ``strength`` of 0 has no inverse and gives infinite or NaN values.
-
-        Args:
-            coc: ``(B, 1, H, W)`` or ``(..., H, W)``, signed radius in pixels.
-            width: width of the whole image in pixels; without effect on the result.
-
-        Returns:
-            The shape of ``coc``, float32 or float64.
-
-        Raises:
-            TypeError: ``coc`` is no floating-point tensor, or ``width`` no integer.
-            ValueError: wrong shape or device, or ``width`` < 1.
-
-        Example:
-            >>> DisparityLens(30.0, focus_disparity=0.5).depth(torch.tensor([[15.0]]), width=640).item()
-            0.0
-        """
-        c, strength, focus = self._align("coc", coc, width)
-        return focus - c / strength
-
-
-def _optics(f: Tensor, n: Tensor, df: Tensor, sensor: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """Pixels of CoC per dioptre of defocus, and the reciprocal focus distance: ``coc = gain * (1/df - 1/d)``.
-
-    From the usual form: ``(d - df) / d = df * (1/df - 1/d)`` and ``df / (df - F) = 1 / (1 - F/df)``.
-    """
-    focus = df.reciprocal()
-    return f * f / (2 * n) / (1 - f * focus) * width / sensor, focus
-
-
-def _distance(dioptres: Tensor) -> Tensor:
-    """Reciprocal, with inf and gradient 0 where there is no positive distance; NaN stays NaN."""
-    beyond = dioptres <= 0
-    return dioptres.masked_fill(beyond, 1).reciprocal().masked_fill(beyond, math.inf)
-
-
-def _check_width(width: int) -> None:
+def check_width(width: object) -> None:
+    """Raise unless ``width`` is a number of pixels."""
     if not isinstance(width, int | torch.SymInt) or isinstance(width, bool):
         raise TypeError(f"width: expected an integer, got {type(width).__name__}")
     if width < 1:
         raise ValueError(f"width: expected at least 1, got {width}")
 
 
-def _check_sharpness(max_coc: float, width: int) -> None:
-    if not isinstance(max_coc, Real) or isinstance(max_coc, bool):
-        raise TypeError(f"max_coc: expected a number, got {type(max_coc).__name__}")
-    if not 0 < max_coc < math.inf:
-        raise ValueError(f"max_coc: expected a positive finite number of pixels, got {max_coc}")
-    _check_width(width)
-
-
-def _check_map(name: str, x: Tensor, good: Tensor, want: str) -> None:
-    """Raise unless all values are good; one bool crosses to the host."""
-    if not good.all():
+def check_map(name: str, x: Tensor, good: Tensor, want: str) -> None:
+    """Raise unless all values of a map are good; one bool crosses to the host. Compiled code is not checked."""
+    if not torch.compiler.is_compiling() and not good.all():
         bad = x[~good].sort().values  # NaN sorts last, so the smallest is a number where there is one
         raise ValueError(f"{name}: expected {want}, got {len(bad)} bad of {x.numel()}, the smallest {bad[0].item():g}")

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchbokeh.lens.field_map import Field, FieldMap
 from torchbokeh.lens.glass import relative_focal_length
-from torchbokeh.lens.parameters import Held, check_parameter
+from torchbokeh.lens.parameters import ParametricModule, check_parameter
 from torchbokeh.ops.spectrum import HIGH, LOW, Weight, spectral_bands
 
 Spectrum = Literal["rgb", "continuous"]
@@ -41,7 +41,7 @@ class Light(NamedTuple):
     rgb: tuple[float, float, float]
 
 
-class Dispersion(Held):
+class Dispersion(ParametricModule):
     """Axial and lateral chromatic aberration of a lens (chapter 4 of the defocus and bokeh dissertation).
 
     *Axial*: glass bends short waves more, so their focal length is shorter: ``F(λ) = F (1 + axial (f(λ) - 1))`` with
@@ -101,8 +101,8 @@ class Dispersion(Held):
             raise ValueError("equaliser: expected None with spectrum 'rgb', got one")
         self.glass, self.spectrum, self.reference = glass, spectrum, float(reference)
         self.axial_map, self.lateral_map, self.equaliser = axial_map, lateral_map, equaliser
-        self._hold(axial=axial, lateral=lateral)
-        for name, value in self._values().items():
+        self.keep(axial=axial, lateral=lateral)
+        for name, value in self.values().items():
             check_parameter(name, value, value.isfinite(), "a finite strength")
         for end in self.wavelengths():
             good = self.relative_focal_length(end) > 0

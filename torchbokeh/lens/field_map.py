@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,30 +12,21 @@ BOUND = 20.0
 """Largest value of a reciprocal: it is bounded where its argument goes to 0."""
 
 
-class Field(NamedTuple):
-    """Where the pixels of a picture are, ``(H, W)`` each.
+MIDDLE = 1e-12
+"""Square of a distance in px below which a place counts as the middle."""
 
-    Attributes:
-        x: to the right from the middle, in px.
-        y: downwards from the middle, in px.
-        t: distance from the middle; 1 in the corners of the sensor.
-        theta: angle about the middle in radians, 0 to the right and pi / 2 downwards.
+
+class Field:
+    """Where the pixels of a picture are.
+
+    Args:
+        x: ``(H, W)`` to the right from the middle of the sensor, in px.
+        y: ``(H, W)`` downwards from there, in px.
+        size: ``(H, W)`` of the sensor in px.
     """
 
-    x: Tensor
-    y: Tensor
-    t: Tensor
-    theta: Tensor
-
-    @classmethod
-    def of(cls, x: Tensor, y: Tensor, size: tuple[int, int]) -> "Field":
-        """The field at places in px from the middle of a sensor of ``(H, W)`` px."""
-        square = x.square() + y.square()
-        # The root has no slope in the middle, and the angle no value.
-        middle = square < 1e-12
-        radius = torch.where(middle, 1.0, square).sqrt() * ~middle
-        theta = torch.atan2(torch.where(middle, 0.0, y), torch.where(middle, 1.0, x))
-        return cls(x, y, radius / (math.hypot(*size) / 2), theta)
+    def __init__(self, x: Tensor, y: Tensor, size: tuple[int, int]) -> None:
+        self.x, self.y, self.size = x, y, size
 
     @classmethod
     def pixels(cls, size: tuple[int, int], margin: int, like: Tensor) -> "Field":
@@ -43,7 +34,25 @@ class Field(NamedTuple):
         height, width = size
         y, x = (torch.arange(n, dtype=like.dtype, device=like.device) - (n - 1) / 2 for n in size)
         sensor = height - 2 * margin, width - 2 * margin
-        return cls.of(x.expand(height, width), y[:, None].expand(height, width), sensor)
+        return cls(x.expand(height, width), y[:, None].expand(height, width), sensor)
+
+    @cached_property
+    def t(self) -> Tensor:
+        """Distance from the middle ``(H, W)``; 1 in the corners of the sensor."""
+        square = self._square
+        # The root has no slope in the middle, and the angle no value.
+        middle = square < MIDDLE
+        return torch.where(middle, 1.0, square).sqrt() * ~middle / (math.hypot(*self.size) / 2)
+
+    @cached_property
+    def theta(self) -> Tensor:
+        """Angle about the middle ``(H, W)`` in radians, 0 to the right and pi / 2 downwards."""
+        middle = self._square < MIDDLE
+        return torch.atan2(torch.where(middle, 0.0, self.y), torch.where(middle, 1.0, self.x))
+
+    @property
+    def _square(self) -> Tensor:
+        return self.x.square() + self.y.square()
 
 
 def _identity(t: Tensor, _: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Modules that hold physical parameters: numbers as buffers, what is to be learned as it is."""
+"""Modules with physical parameters: numbers are buffers, what is to be learned stays as it is."""
 
 from numbers import Real
 
@@ -6,21 +6,26 @@ import torch
 from torch import Tensor, nn
 
 
-class Held(nn.Module):
-    """Base of modules with parameters that are scalars, or ``(B,)`` with one value for each item of the batch."""
+class ParametricModule(nn.Module):
+    """Base of modules with physical parameters: scalars, or ``(B,)`` with one value for each item of the batch."""
 
     _names: tuple[str, ...]
 
     def extra_repr(self) -> str:
         """Name and value of every parameter."""
-        return ", ".join(f"{name}={_show(value)}" for name, value in self._values().items())
+        return ", ".join(f"{name}={_show(value)}" for name, value in self.values().items())
 
-    def _values(self) -> dict[str, Tensor]:
-        """Every parameter and buffer, in the order in which :meth:`_hold` got them."""
+    def values(self) -> dict[str, Tensor]:
+        """Name and tensor of every parameter, in the order in which :meth:`keep` got them."""
         return {name: getattr(self, name) for name in self._names}
 
-    def _hold(self, **values: float | Tensor) -> None:
-        """Keep lens parameters: numbers and tensors as buffers, an ``nn.Parameter`` as the one it is."""
+    def keep(self, **values: float | Tensor) -> None:
+        """Keep parameters: numbers and tensors as buffers, an ``nn.Parameter`` as the one it is.
+
+        Raises:
+            TypeError: not a number or floating-point tensor.
+            ValueError: shapes or devices that do not go together.
+        """
         # Numbers join the tensors' device: a focus distance predicted on a GPU needs no further .to().
         device = next((v.device for v in values.values() if isinstance(v, Tensor)), None)
         batched: tuple[str, int] | None = None

@@ -1,5 +1,5 @@
 """What a scene needs, decided once."""
 
-from torchbokeh.plan.plan import Plan
+from torchbokeh.plan.plan import Plan, SplattingPlan
 
-__all__ = ["Plan"]
+__all__ = ["Plan", "SplattingPlan"]

@@ -1,15 +1,20 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from torchbokeh.lens.dispersion import Light
 from torchbokeh.ops.convolve import CONVOLVE_FROM
-from torchbokeh.plan.quality import Quality
+from torchbokeh.picture.request import Request
+from torchbokeh.plan.look import Look
+from torchbokeh.plan.quality import Detail, Quality
 from torchbokeh.psfs.combined import STILL
 
 Hidden = Literal["nothing", "filled", "given", "layers"]
+
+Route = Literal["sharp", "uniform", "layers", "foreground", "surface"]
 
 STEP = 2.0
 """Change of a radius in px over one part of the exposure."""
@@ -23,53 +28,11 @@ _HIDDEN = {
 }
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What a look at a scene finds.
-
-    Attributes:
-        size: ``(H, W)`` of the image.
-        coc_range: smallest and largest signed CoC, in px, after ``max_coc``.
-        clamped: share of the pixels whose radius ``max_coc`` cut.
-        motion: longest displacement in px over the open shutter.
-        pan: the displacement (dx, dy) that all pixels share; None where they do not.
-        approach: largest change of a signed radius in px while the shutter is open.
-        layer_count: number of input layers; 0 for a plain image.
-        layers: indices of those that hold anything.
-        opaque: indices of those that cover everything: their coverage needs no looking at.
-    """
-
-    size: tuple[int, int]
-    coc_range: tuple[float, float]
-    clamped: float
-    motion: float
-    pan: tuple[float, float] | None
-    approach: float
-    layer_count: int
-    layers: tuple[int, ...]
-    opaque: tuple[int, ...]
-
-    @property
-    def moves(self) -> bool:
-        """Whether motion is to be seen."""
-        return self.motion > STILL[0] or self.approaches
-
-    @property
-    def approaches(self) -> bool:
-        """Whether motion toward the camera, or away, is to be seen."""
-        return self.approach > STILL[0]
-
-    @property
-    def parts(self) -> int:
-        """Into how many parts of constant radius the exposure is cut."""
-        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
-
-
-@dataclass(frozen=True)
-class Plan(Seen):
+@dataclass(frozen=True, kw_only=True)
+class Plan(Look):
     """What a scene needs, and by that what is left out.
 
-    Attributes, beside those of what was `Seen`:
+    Attributes, beside those of the `Look` that it was decided by:
         sharp: every radius is below half a pixel and nothing moves: the image passes through.
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
@@ -97,6 +60,11 @@ class Plan(Seen):
     fading: tuple[tuple["Plan", float], ...] = ()
 
     @property
+    def parts(self) -> int:
+        """Into how many parts of constant radius the exposure is cut."""
+        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
+
+    @property
     def uniform(self) -> float | None:
         """The signed radius in px that all pixels share, where one convolution does it; else None."""
         low, high = self.coc_range
@@ -107,10 +75,52 @@ class Plan(Seen):
         return low if self.highest == 0 and abs(low) >= CONVOLVE_FROM else None
 
     @property
+    def detail(self) -> Detail:
+        """How finely it is carried out."""
+        return Detail(self.quality.merging, self.highest, self.quality.coarse)
+
+    @property
+    def route(self) -> Route:
+        """How the picture is made, but for dispersion and what fades."""
+        if self.sharp:
+            return "sharp"
+        if self.layer_count:
+            return "layers"
+        if self.uniform is not None:
+            return "uniform"
+        return "foreground" if len(self.bins) == 2 else "surface"
+
+    def pictures(self, share: float = 1.0) -> Iterator["Picture"]:
+        """The pictures that make up this one, by one route each: through every light, and of every plan that fades."""
+        own = share * (1.0 - sum(part for _, part in self.fading)) if self.fading else share
+        if self.colours:
+            for colour in self.colours:
+                yield from (picture._replace(colour=colour) for picture in colour.plan.pictures(own))
+        else:
+            yield Picture(None, self, own)
+        for other, part in self.fading:
+            yield from other.pictures(share * part)
+
+    @property
     def cuts(self) -> list[int]:
         """All numbers of sub-apertures each way that occur in it and in its parts."""
-        others = [*(one.plan for one in self.colours), *(other for other, _ in self.fading)]
-        return sorted({self.subapertures, *(count for other in others for count in other.cuts)})
+        return sorted({picture.plan.subapertures for picture in self.pictures()})
+
+    def check(self, request: Request) -> None:
+        """Raise a ValueError unless the plan was made for requests like this one."""
+        image = request.image
+        known = all(isinstance(n, int) for n in image.shape)  # an export may leave the size open
+        if known and self.size != tuple(image.shape[-2:]):
+            raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {self.size}")
+        if self.motion > STILL[0] and not request.motion.displacements:
+            raise ValueError("plan: expected the motion it was made with, got none")
+        if self.approaches and request.motion.shutter_coc is None:
+            raise ValueError("plan: expected the shutter_depth it was made with, got none")
+        count = image.shape[1] if request.layered else 0
+        if self.layer_count != count:
+            raise ValueError(f"plan: expected one for {count} layers, got one for {self.layer_count}")
+        if self.hidden in ("filled", "given") and (self.hidden == "given") != (request.background is not None):
+            raise ValueError(f"plan: expected the background it was made with ({self.hidden}), got another")
 
     def __str__(self) -> str:
         height, width = self.size
@@ -170,3 +180,65 @@ class Colour(NamedTuple):
     light: Light
     enlarged: bool
     plan: Plan
+
+
+class Picture(NamedTuple):
+    """One of the pictures that a plan is made up of.
+
+    Attributes:
+        colour: the light that it is of; None for all of it.
+        plan: its plan, of which only the route by itself counts.
+        share: how much it counts for.
+    """
+
+    colour: Colour | None
+    plan: Plan
+    share: float
+
+
+@dataclass(frozen=True)
+class SplattingPlan:
+    """What one layer needs.
+
+    Attributes:
+        size: ``(H, W)`` of the image.
+        largest: the largest radius in px.
+        quality: the operating point.
+        highest: the coarsest level that pixels are merged on; 0 if none are.
+        predicted_error: relative L1 error against the exact splat, see `Quality`.
+        sharp: every radius is below half a pixel: the image passes through.
+        uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
+    """
+
+    size: tuple[int, int]
+    largest: float
+    quality: Quality
+    highest: int
+    predicted_error: float
+    sharp: bool
+    uniform: float | None = None
+
+    @property
+    def detail(self) -> Detail:
+        """How finely it is carried out."""
+        return Detail(self.quality.merging, self.highest)
+
+    def check(self, request: Request) -> None:
+        """Raise a ValueError unless the plan was made for requests like this one."""
+        size = tuple(request.image.shape[-2:])
+        if all(isinstance(n, int) for n in size) and self.size != size:  # an export may leave the size open
+            raise ValueError(f"plan: expected one for size {size}, got one for {self.size}")
+
+    def __str__(self) -> str:
+        height, width = self.size
+        head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
+        if self.sharp:
+            return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.uniform is not None:
+            return f"{head}\nEvery pixel has the same PSF: a single convolution."
+        if self.highest == 0:
+            return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
+        return (
+            f"{head}\nQuality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
+            f"merged; predicted relative error {self.predicted_error:.2g}."
+        )

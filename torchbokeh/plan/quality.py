@@ -31,6 +31,26 @@ class Quality(NamedTuple):
     coarse: bool
 
 
+class Detail(NamedTuple):
+    """How finely surfaces are splatted and composed.
+
+    Attributes:
+        merging: how far pixels are merged by radius; ``None``: not at all.
+        highest: the coarsest level that they are merged on.
+        coarse: where they are merged, find in blocks how dense the splats of a surface are; its CoC need then not be
+            continued to where it is not.
+    """
+
+    merging: Merging | None = None
+    highest: int = 0
+    coarse: bool = False
+
+    @property
+    def in_blocks(self) -> int:
+        """The coarsest level of a picture of blocks of 4 x 4 pixels."""
+        return max(self.highest - 2, 0)
+
+
 QUALITIES = (
     Quality("exact", None, 0.0, 8, (2, 3), False),
     Quality("high", Merging(8.0, 0.005), 0.006, 8, (2, 3), False),

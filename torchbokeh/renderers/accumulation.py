@@ -1,15 +1,13 @@
 """The reference renderer: the mean of many views through the lens while the shutter is open."""
 
 from numbers import Real
-from typing import Any
 
 from torch import Tensor, nn
 
 from torchbokeh.lens import Lens
 from torchbokeh.ops import sampling
 from torchbokeh.ops.checks import check_image, check_whole
-from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.picture.coc import signed_coc
+from torchbokeh.picture.request import Optics, Request
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene
@@ -17,6 +15,7 @@ from torchbokeh.views.cards import accumulate_scene
 from torchbokeh.views.layers import accumulate_layers
 from torchbokeh.views.points import Views
 from torchbokeh.views.prism import Prism
+from torchbokeh.views.setup import ViewSettings
 
 MOST = 1 << 20
 """Views, and sub-samples of each, at most: there are tables of them."""
@@ -136,32 +135,26 @@ class AccumulationBuffer(nn.Module):
             TypeError: an argument of the wrong kind.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        settings: dict[str, Any] = {
-            "level_of_detail": self.level_of_detail,
-            "reuse": self.reuse,
-            "subsamples": self.subsamples,
-        }
+        settings = ViewSettings(self.level_of_detail, self.reuse, self.subsamples)
         if isinstance(source, Scene):
             if not isinstance(depth, Camera):
                 raise TypeError(f"depth: expected a Camera beside the scene, got {type(depth).__name__}")
             for name, value in (("lens", self.lens), ("coc", coc), ("motion", motion)):
                 if value is not None:
                     raise ValueError(f"{name}: expected None for a scene, got {type(value).__name__}")
-            return accumulate_scene(source, depth, *self._spread(depth.lens, depth.size), **settings)
+            return accumulate_scene(source, depth, *self._spread(depth.lens, depth.size), settings)
         if not isinstance(source, Tensor):
             raise TypeError(f"source: expected a Scene, with its Camera, or layers, got {type(source).__name__}")
         check_image("source", source, ("B", "L", 4, "H", "W"))
-        signed = signed_coc(self.lens, source, depth, coc)
         if motion is not None:
             check_image("motion", motion, (*source.shape[:2], 2, *source.shape[3:]), like=source)
             if not bool(motion.isfinite().all()):
                 raise ValueError(f"motion: expected finite ways, got {int((~motion.isfinite()).sum())} that are not")
-        dtype = compute_dtype(source, signed)
-        layers, radii = source.to(dtype), signed.to(dtype)
-        moved = None if motion is None else motion.to(dtype)
-        views, prism = self._spread(self.lens, (source.shape[3], source.shape[4]))
-        out = accumulate_layers(layers, radii, moved, views, prism, **settings)
-        return out.to(source.dtype)
+        request = Request.of(Optics(self.lens), source, depth, coc=coc, motion=motion)
+        layers, radii, moved, *_ = request.working()
+        views = self._spread(self.lens, request.sensor.size)
+        moved = moved.displacements[0] if moved else None
+        return request.answered(accumulate_layers(layers, radii, moved, *views, settings))
 
     def _spread(self, lens: Lens | None, size: tuple[int, int]) -> tuple[Views, Prism | None]:
         """The views, and what a lens does to their wavelengths where these are told apart."""

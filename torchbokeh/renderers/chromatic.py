@@ -47,7 +47,7 @@ class ChromaticAccumulation(AccumulationBuffer):
         dispersion = None if lens is None else lens.dispersion
         if lens is None or dispersion is None:
             return super()._spread(lens, size)
-        for name, value in (*lens._values().items(), *dispersion._values().items()):
+        for name, value in (*lens.values().items(), *dispersion.values().items()):
             if value.dim():
                 raise ValueError(
                     f"lens: expected scalar parameters with dispersion, got {name} of shape {tuple(value.shape)}"

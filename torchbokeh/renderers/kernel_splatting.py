@@ -1,60 +1,23 @@
 """One layer: every pixel spreads its point-spread function, and the sum is divided by the coverage."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
-from torchbokeh.banks.splat import bank_labels, blur_with_bank, needed
-from torchbokeh.ops.checks import check_flag, check_image
-from torchbokeh.ops.composite import TINY
+from torchbokeh.banks.splat import bank_labels, blur_with_bank
+from torchbokeh.compose.composition import blur_one_layer
+from torchbokeh.compose.routes import Pieces
+from torchbokeh.ops.checks import check_flag
 from torchbokeh.ops.convolve import CONVOLVE_FROM, blur_uniform
-from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.ops.merge import Merging, highest_level, splat_merged
-from torchbokeh.ops.spans import MIN_RADIUS, Profile
-from torchbokeh.ops.splat import splat_spans
-from torchbokeh.picture.coc import signed_coc
-from torchbokeh.plan.quality import QUALITIES, Quality, check_quality, choose, merged_shares
+from torchbokeh.ops.merge import highest_level
+from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.picture.motion import Motion
+from torchbokeh.picture.request import Optics, Request
+from torchbokeh.picture.sensor import Sensor
+from torchbokeh.plan.plan import SplattingPlan
+from torchbokeh.plan.quality import QUALITIES, check_quality, choose, merged_shares
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.model import Labels
-
-
-@dataclass(frozen=True)
-class SplattingPlan:
-    """What one layer needs.
-
-    Attributes:
-        size: ``(H, W)`` of the image.
-        largest: the largest radius in px.
-        quality: the operating point.
-        highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error against the exact splat, see `Quality`.
-        sharp: every radius is below half a pixel: the image passes through.
-        uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
-    """
-
-    size: tuple[int, int]
-    largest: float
-    quality: Quality
-    highest: int
-    predicted_error: float
-    sharp: bool
-    uniform: float | None = None
-
-    def __str__(self) -> str:
-        height, width = self.size
-        head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
-        if self.sharp:
-            return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
-        if self.uniform is not None:
-            return f"{head}\nEvery pixel has the same PSF: a single convolution."
-        if self.highest == 0:
-            return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
-        return (
-            f"{head}\nQuality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
-            f"merged; predicted relative error {self.predicted_error:.2g}."
-        )
+from torchbokeh.renderers.planned import Planned, fitting
 
 
 class KernelSplatting(nn.Module):
@@ -139,23 +102,7 @@ class KernelSplatting(nn.Module):
         motion: Tensor | None = None,
     ) -> SplattingPlan:
         """Look at the radii once, in one small copy from the device. Arguments are those of `forward`."""
-        return self._plan(image, self._labels(image, coc, depth, motion).coc)
-
-    def _plan(self, image: Tensor, coc: Tensor | None) -> SplattingPlan:
-        coc = torch.zeros_like(image[:, :1]) if coc is None else coc.detach()
-        radius = coc.abs()
-        size = (image.shape[-2], image.shape[-1])
-        if image.numel() == 0:
-            return SplattingPlan(size, 0.0, QUALITIES[0], 0, 0.0, True)
-        look = [*coc.aminmax(), *merged_shares(radius, self.quality, self.tolerance)]
-        low, high, *shares = torch.stack(look).tolist()
-        largest = max(-low, high)
-        quality, error = choose(self.quality, self.tolerance, shares)
-        highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
-        if self.bank is not None:
-            return SplattingPlan(size, largest, quality, highest if self.bank.model.merges else 0, error, False)
-        one = low if low == high and highest == 0 and largest >= CONVOLVE_FROM else None
-        return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS, one)
+        return self.decide(self.request(image, coc, depth=depth, motion=motion))
 
     def forward(
         self,
@@ -184,52 +131,71 @@ class KernelSplatting(nn.Module):
             TypeError: an argument is not a floating-point tensor, or not a `SplattingPlan`.
             ValueError: shapes, devices or values do not fit: see the message.
         """
-        labels = self._labels(image, coc, depth, motion)
-        if plan is None:
-            plan = self._plan(image, labels.coc)
-        elif not isinstance(plan, SplattingPlan):
-            raise TypeError(f"plan: expected a SplattingPlan, got {type(plan).__name__}")
-        elif plan.size != tuple(image.shape[-2:]):
-            raise ValueError(f"plan: expected one for size {tuple(image.shape[-2:])}, got one for {plan.size}")
-        given = [t for t in labels if t is not None]
-        asked = any(t.requires_grad for t in given)
-        profile = self.aperture.profile()
-        if plan.sharp and not (asked or profile.knots.requires_grad):
-            return image.clone()
-        with torch.autocast(image.device.type, enabled=False):
-            dtype = compute_dtype(image, *given)
-            source, labels = image.to(dtype), Labels(*(None if t is None else t.to(dtype) for t in labels))
-            if self.bank is not None:
-                out = blur_with_bank(
-                    source, labels, self.bank, plan.quality.merging, plan.highest, interpolate=self.interpolate
-                )
-            elif plan.uniform is not None and not asked:
-                out = blur_uniform(source, plan.uniform, profile)
-            else:
-                out = blur_one_layer(source, needed(labels), profile, plan.quality.merging, plan.highest)
-        return out.to(image.dtype)
+        request = self.request(image, coc, depth=depth, motion=motion)
+        plan = self.decide(request) if plan is None else fitting(plan, SplattingPlan, request)
+        return request.answered(self.paint(request, plan), *self.aperture.profile())
 
-    def _labels(self, image: Tensor, coc: Tensor | None, depth: Tensor | None, motion: Tensor | None) -> Labels:
+    def request(
+        self,
+        image: Tensor,
+        coc: Tensor | None = None,
+        *,
+        depth: Tensor | None = None,
+        motion: Tensor | None = None,
+    ) -> Request:
+        """Check what `forward` is called with."""
         if self.bank is not None:
-            return bank_labels(self.bank, image, coc, depth, motion)
-        for name, given in (("depth", depth), ("motion", motion)):
-            if given is not None:
+            labels = bank_labels(self.bank, image, coc, depth, motion)
+            found = Motion() if motion is None else Motion((motion,))
+            sensor = Sensor((image.shape[2], image.shape[3]))
+            return Request(
+                image, torch.zeros_like(image[:, :1]) if coc is None else coc, found, None, sensor, labels=labels
+            )
+        for name, value in (("depth", depth), ("motion", motion)):
+            if value is not None:
                 raise ValueError(f"{name}: expected None without a bank, got a tensor")
-        check_image("image", image, ("B", "C", "H", "W"))
-        return Labels(signed_coc(None, image, None, coc))
+        return Request.of(Optics(), image, coc=coc)
 
+    @torch.no_grad()
+    def decide(self, request: Request) -> SplattingPlan:
+        """What a request needs."""
+        size, coc = request.sensor.size, request.coc
+        if request.image.numel() == 0:
+            return SplattingPlan(size, 0.0, QUALITIES[0], 0, 0.0, True)
+        look = [*coc.aminmax(), *merged_shares(coc, self.quality, self.tolerance)]
+        low, high, *shares = torch.stack(look).tolist()
+        largest = max(-low, high)
+        quality, error = choose(self.quality, self.tolerance, shares)
+        highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
+        if self.bank is not None:
+            return SplattingPlan(size, largest, quality, highest if self.bank.model.merges else 0, error, False)
+        one = low if low == high and highest == 0 and largest >= CONVOLVE_FROM else None
+        return SplattingPlan(size, largest, quality, highest, error, largest <= MIN_RADIUS, one)
 
-def blur_one_layer(image: Tensor, coc: Tensor, profile: Profile, merging: Merging | None, highest: int) -> Tensor:
-    """Splat ``image (B, C, H, W)`` with ``coc (B, 1, H, W)`` and divide by the coverage.
+    def pieces(self, plan: SplattingPlan) -> Pieces:
+        """The whole aperture."""
+        return {1: [self.aperture.profile()]}
 
-    Args:
-        image: linear radiance.
-        coc: signed radius in px.
-        profile: the unit shape of the PSF.
-        merging: how far to merge by radius; ``None``: not at all.
-        highest: the coarsest level to merge on.
-    """
-    if merging is None:
-        out = splat_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, profile, integrate=True)
-        return out[:, :-1] / out[:, -1:].clamp_min(TINY)
-    return splat_merged(image, coc, profile, merging, highest=highest, ones=True, normalise=True)[:, :-1]
+    def paint(self, request: Request, plan: SplattingPlan, pieces: Pieces | None = None) -> Tensor:
+        """The picture ``(B, C, H, W)`` of a request, in at least float32.
+
+        Args:
+            request: as `request` found it good.
+            plan: what to do.
+            pieces: those of `pieces`, where they are known.
+        """
+        ((profile,),) = (self.pieces(plan) if pieces is None else pieces).values()
+        if plan.sharp:
+            return request.image.clone()
+        with torch.autocast(request.image.device.type, enabled=False):
+            image, coc, labels = (request := request.working()).image, request.coc, request.labels
+            if self.bank is not None and labels is not None:
+                settings = self.bank, plan.quality.merging, plan.highest
+                return blur_with_bank(image, labels, *settings, interpolate=self.interpolate)
+            if plan.uniform is not None and not coc.requires_grad:
+                return blur_uniform(image, plan.uniform, profile)
+            return blur_one_layer(image, coc, profile, plan.detail)
+
+    def planned(self, plan: SplattingPlan) -> Planned[SplattingPlan]:
+        """The same renderer with its plan fixed, for `torch.export` and the like."""
+        return Planned(self, plan)

@@ -1,78 +1,18 @@
 """Reconstruction from stochastic samples: each spreads its PSF about where a pinhole would see it (LKS section 6.2)."""
 
-from numbers import Integral
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
-from torchbokeh.compose.surfaces import bin_centres
-from torchbokeh.ops.checks import check_image
+from torchbokeh.ops.checks import check_whole
 from torchbokeh.ops.composite import bin_weights, fill_until_full, pull_push
-from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.ops.planes import pixel_centres
+from torchbokeh.picture.samples import Samples, checked_samples, pinhole_position, pixel_positions
+from torchbokeh.plan.bins import bin_centres
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.model import Labels
 
 KNOWN = 0.1
 """A pixel that all PSFs together cover less than this is filled in from its surroundings, as far as it lacks."""
-
-SLACK = 1e-2
-"""How far in px rounding may put a sample outside its pixel."""
-
-CHANNELS = {"colour": 3, "position": 2, "lens": 2, "time": 1, "coc": 1, "motion": 2}
-"""Of every map of `Samples` that holds numbers."""
-
-
-class Samples(NamedTuple):
-    """Samples of a picture through lens and shutter, S for each pixel, each of one surface.
-
-    Attributes:
-        colour: ``(B, S, 3, H, W)`` linear radiance.
-        position: ``(B, S, 2, H, W)``, where in its pixel the sample is: x and y in px of the picture, 0 being the
-            centre of the first pixel.
-        lens: ``(B, S, 2, H, W)``, its point (x, y) of the lens, in units of the aperture radius.
-        time: ``(B, S, 1, H, W)`` in units of the shutter time: -0.5 is when it opens, 0.5 when it closes.
-        coc: ``(B, S, 1, H, W)`` signed CoC radius in px of the surface, positive behind the focus.
-        motion: ``(B, S, 2, H, W)``, the way (dx, dy) in px of the surface while the shutter is open.
-        present: ``(B, S, 1, H, W)`` bool: False where there is no sample. What the other maps hold there does not
-            count.
-    """
-
-    colour: Tensor
-    position: Tensor
-    lens: Tensor
-    time: Tensor
-    coc: Tensor
-    motion: Tensor
-    present: Tensor
-
-
-def pinhole_position(samples: Samples) -> Tensor:
-    """Where each sample's surface is seen from the middle of the lens at the middle of the exposure: y' of LKS.
-
-    From the point u of the lens, a surface of CoC r that belongs at y' is seen at ``y' + r u``; by the time t its
-    motion m has taken it ``t m`` farther.
-
-    Args:
-        samples: see `Samples`.
-
-    Returns:
-        ``(B, S, 2, H, W)``: x and y in px, 0 being the centre of the first pixel.
-
-    Raises:
-        TypeError: not `Samples`.
-
-    Example:
-        >>> from torchbokeh import scenes
-        >>> from torchbokeh.scenes import samples
-        >>> pinhole_position(samples(*scenes.whirl(size=(24, 32)))).shape
-        torch.Size([1, 1, 2, 24, 32])
-    """
-    if not isinstance(samples, Samples):
-        raise TypeError(f"samples: expected Samples, got {type(samples).__name__}")
-    return samples.position - samples.coc * samples.lens - samples.time * samples.motion
 
 
 def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 4) -> Tensor:
@@ -108,48 +48,13 @@ def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 
         >>> reconstruct(samples(*scenes.whirl(size=(24, 32)))).shape
         torch.Size([1, 3, 24, 32])
     """
-    samples, dtype = _checked(samples), samples.colour.dtype
+    samples, dtype = checked_samples(samples), samples.colour.dtype
     bank = bank_of_motion(samples.colour.device) if bank is None else _checked_bank(bank)
-    if not isinstance(layers, Integral) or isinstance(layers, bool):
-        raise TypeError(f"layers: expected an int, got {layers!r}")
-    if layers < 1:
-        raise ValueError(f"layers: expected at least 1, got {layers}")
+    check_whole("layers", layers, 1, 1 << 16)
     low, high = samples.coc.detach().aminmax()
     bins = _splat_bins(samples, bin_centres(float(low), float(high), layers), bank)
     colour, coverage = fill_until_full([(b[:, :-1], b[:, -1:]) for b in bins])
     return pull_push(colour, (coverage / KNOWN).clamp(0, 1)).to(dtype)
-
-
-def _checked(samples: Samples) -> Samples:
-    """Samples of one dtype, with zeros where there is none."""
-    if not isinstance(samples, Samples):
-        raise TypeError(f"samples: expected Samples, got {type(samples).__name__}")
-    b, s, _, h, w = check_image("samples.colour", samples.colour, ("B", "S", 3, "H", "W")).shape
-    if samples.colour.numel() == 0:
-        raise ValueError(f"samples.colour: expected at least one sample, got shape {tuple(samples.colour.shape)}")
-    present = samples.present
-    if not isinstance(present, Tensor) or present.dtype != torch.bool:
-        kind = present.dtype if isinstance(present, Tensor) else type(present).__name__
-        raise TypeError(f"samples.present: expected a tensor of bools, got {kind}")
-    check_image("samples.present", present.float(), (b, s, 1, h, w), like=samples.colour)
-    dtype, maps = compute_dtype(samples.colour), {}
-    for name, channels in CHANNELS.items():
-        given = check_image(f"samples.{name}", getattr(samples, name), (b, s, channels, h, w), like=samples.colour)
-        maps[name] = torch.where(present, given.to(dtype), 0.0)
-        bad = int((~maps[name].isfinite()).sum())
-        if bad:
-            raise ValueError(f"samples.{name}: expected finite numbers where a sample is present, got {bad} others")
-    off = float(((maps["position"].detach() - pixel_positions(maps["position"])) * present).abs().max())
-    if off > 0.5 + SLACK:
-        raise ValueError(
-            f"samples.position: expected points within their own pixels, got one {off:g} px from its centre"
-        )
-    return samples._replace(**maps)
-
-
-def pixel_positions(like: Tensor) -> Tensor:
-    """Centres of all pixels ``(2, H, W)``, x and y in px, 0 being that of the first."""
-    return torch.stack(pixel_centres((like.shape[-2], like.shape[-1]), like)) - 0.5
 
 
 def _checked_bank(bank: PsfBank) -> PsfBank:

@@ -41,7 +41,7 @@ class Camera:
     def __post_init__(self) -> None:
         if not isinstance(self.lens, ThinLens):
             raise TypeError(f"lens: expected a ThinLens, got {type(self.lens).__name__}")
-        for name, value in self.lens._values().items():
+        for name, value in self.lens.values().items():
             if value.dim():
                 raise ValueError(f"lens: expected scalar parameters, got {name} of shape {tuple(value.shape)}")
         object.__setattr__(self, "size", check_size(self.size))

@@ -8,8 +8,8 @@ from torchbokeh.ops.checks import MOST_PIXELS, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.planes import Plates, pixel_centres
 from torchbokeh.ops.sampling import aperture_points
+from torchbokeh.picture.samples import Samples
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.renderers.reconstruction import Samples
 from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3

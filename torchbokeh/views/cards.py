@@ -1,7 +1,6 @@
 """Many views of a scene: the accumulation buffer's way to see it."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,28 +9,12 @@ from torchbokeh.ops.planes import Plates, render_planes
 from torchbokeh.ops.raycast import subsample_blur
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene, inverse3, texel_area
-from torchbokeh.views.points import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
+from torchbokeh.views.points import Views
 from torchbokeh.views.prism import Prism
+from torchbokeh.views.setup import Bounds, ViewSettings, scheduled
 
 CHUNK = 1 << 21
 """Pixels of frames held at a time while they wait for their sub-samples; only within these are renderings shared."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Of every card in a view, how blurred and how fast it may be.
-
-    Attributes:
-        low: ``(K,)`` smallest signed CoC in px.
-        high: ``(K,)`` largest one.
-        motion: ``(K,)`` greatest speed, in px for the time that the shutter is open; ``inf`` where it has no bound.
-        texel: ``(K,)`` area of a texel on the screen, in px²; 0 where it is not known.
-    """
-
-    low: Tensor
-    high: Tensor
-    motion: Tensor
-    texel: Tensor
 
 
 @torch.no_grad()
@@ -57,42 +40,22 @@ def bounds(scene: Scene, plates: Plates, camera: Camera) -> Bounds:
     motion = torch.where(inside.all(1).all(0), motion, torch.inf)
     still = torch.tensor(plates.mirror)  # the backdrop's corners may be anywhere, and it does not move
     texel = torch.stack([texel_area(matrix[middle, k], p[0]) for k, p in enumerate(plates.levels)])
-    return Bounds(flat.amin(0), flat.amax(0), torch.where(still, 0.0, motion), texel)
+    coarsest = torch.tensor([len(p) - 1 for p in plates.levels])
+    return Bounds(flat.amin(0), flat.amax(0), torch.where(still, 0.0, motion), texel, coarsest)
 
 
-def accumulate_scene(
-    scene: Scene,
-    camera: Camera,
-    views: Views,
-    prism: Prism | None = None,
-    *,
-    level_of_detail: float,
-    reuse: int,
-    subsamples: int,
-) -> Tensor:
+def accumulate_scene(scene: Scene, camera: Camera, views: Views, prism: Prism | None, settings: ViewSettings) -> Tensor:
     """The mean of the views ``(1, 4, H, W)``, or their sum in the colours of a prism.
 
     See `torchbokeh.AccumulationBuffer` and `torchbokeh.ChromaticAccumulation`.
     """
     if len(scene) == 0:
         return torch.zeros(1, 4, *camera.size)
-    plates = scene.plates() if level_of_detail else scene.plates(levels=1)
-    seen = bounds(scene, plates, camera)
-    count = len(views)
-    level = torch.zeros(count, len(plates.levels), dtype=torch.long)
-    if level_of_detail:
-        most = torch.tensor([len(p) - 1 for p in plates.levels])
-        below, above = (0.0, 0.0) if prism is None else prism.shifts()
-        radius = smallest_radius(seen.low + below, seen.high + above)
-        level = detail_levels(radius, seen.texel, level_of_detail, count, most)
-    points = views.lens if prism is None else views.lens.unique(dim=0)  # wavelengths share points
-    offsets, scale = subsample_offsets(points, subsamples)
-    views = Views(views.lens * scale, views.time, views.shift)
-    parents = None
-    if reuse:
-        parents = shared_views(views, largest_coc(seen.low, seen.high), seen.motion, reuse, level)
+    plates = scene.plates() if settings.level_of_detail else scene.plates(levels=1)
+    count, limits = len(views), bounds(scene, plates, camera)
+    views, level, parents, offsets = scheduled(views, limits, prism, settings, by_wavelength=False)
     inverse = inverse3(scene.homographies(camera, views.lens, views.time, views.shift))
-    if not subsamples and prism is None:
+    if not settings.subsamples and prism is None:
         return render_planes(plates, inverse, level, camera.size, parents=parents)[0]
     sky = scene.backdrop is None or bool(plates.infinite[-1])
     texels = plates.levels[0][0]
@@ -109,7 +72,7 @@ def accumulate_scene(
             shared = (chosen[:, None] == chosen).int().argmax(0)
         frames, nearest = render_planes(plates, own, lod, camera.size, parents=shared, frames=True)
         coc = _coc(camera, nearest.reciprocal())
-        if prism is not None and not subsamples:
+        if prism is not None and not settings.subsamples:
             total = total + prism.moved(frames, coc.to(frames), views, start).sum(0, keepdim=True)
             continue
         background = None

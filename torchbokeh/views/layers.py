@@ -1,7 +1,5 @@
 """Many views of layers: each is warped by the parallax of its own pixels."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -10,11 +8,10 @@ from torchbokeh.compose.surfaces import continued
 from torchbokeh.lens.field_map import Field
 from torchbokeh.ops.planes import pixel_centres
 from torchbokeh.ops.raycast import subsample_blur
-from torchbokeh.views.points import Views, detail_levels, largest_coc, shared_views, smallest_radius, subsample_offsets
+from torchbokeh.picture.sensor import STEPS
+from torchbokeh.views.points import Views
 from torchbokeh.views.prism import Prism
-
-STEPS = 4
-"""Steps to the point that a view moves to a pixel; each leaves an error smaller by the slope of the parallax."""
+from torchbokeh.views.setup import Bounds, ViewSettings, scheduled
 
 LEVELS = 8
 
@@ -72,52 +69,25 @@ def _at(image: Tensor, place: Tensor, texel: int) -> Tensor:
 
 
 def accumulate_layers(
-    layers: Tensor,
-    coc: Tensor,
-    motion: Tensor | None,
-    views: Views,
-    prism: Prism | None = None,
-    *,
-    level_of_detail: float,
-    reuse: int,
-    subsamples: int,
+    layers: Tensor, coc: Tensor, motion: Tensor | None, views: Views, prism: Prism | None, settings: ViewSettings
 ) -> Tensor:
     """The mean of the views ``(B, 4, H, W)``, or their sum in the colours of a prism.
 
     See `torchbokeh.AccumulationBuffer` and `torchbokeh.ChromaticAccumulation`.
     """
-    b, count, _, h, w = layers.shape
+    b, _, _, h, w = layers.shape
     if layers.numel() == 0:
         return layers.new_zeros(b, 4, h, w)
-    if b > 1 and (level_of_detail or reuse):  # what an item may share or leave out does not depend on the others
+    if b > 1 and (settings.level_of_detail or settings.reuse):
+        # What an item may share or leave out does not depend on the others.
         moved = [None] * b if motion is None else motion.split(1)
-        settings: dict[str, Any] = {"level_of_detail": level_of_detail, "reuse": reuse, "subsamples": subsamples}
         each = zip(layers.split(1), coc.split(1), moved, strict=True)
-        return torch.cat([accumulate_layers(*one, views, prism, **settings) for one in each])
-    points = views.lens if prism is None else views.lens.unique(dim=0)  # wavelengths share points
-    offsets, scale = subsample_offsets(points, subsamples)
+        return torch.cat([accumulate_layers(*one, views, prism, settings) for one in each])
     # The pixels of the input are means already: shifting them would only blur them once more.
-    views = Views(views.lens * scale, views.time, torch.zeros_like(views.shift))
-    with torch.no_grad():
-        held = layers[:, :, 3:] > 0
-        low = torch.where(held, coc, torch.inf).movedim(1, 0).flatten(1).amin(1).double().cpu()
-        high = torch.where(held, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1).double().cpu()
-        speed = torch.zeros_like(low)
-        if motion is not None:
-            speed = (motion.norm(dim=2, keepdim=True) * held).movedim(1, 0).flatten(1).amax(1).double().cpu()
-    kept = [k for k in range(count) if low[k] <= high[k]]
-    low, high, speed = low[kept], high[kept], speed[kept]
-    level = torch.zeros(len(views), len(kept), dtype=torch.long)
-    if level_of_detail:
-        most = torch.full_like(low, min(LEVELS, max(layers.shape[3:]).bit_length()) - 1)
-        below, above = (0.0, 0.0) if prism is None else prism.shifts()
-        radius = smallest_radius(low + below, high + above)
-        level = detail_levels(radius, torch.ones_like(low), level_of_detail, len(views), most)
-    parents = torch.arange(len(views))[:, None].expand_as(level)
-    if reuse:
-        # Only views of one wavelength move a layer alike.
-        kinds = level if prism is None else level + (LEVELS + 1) * prism.kinds()[:, None]
-        parents = shared_views(views, largest_coc(low, high), speed, reuse, kinds)
+    views = Views(views.lens, views.time, torch.zeros_like(views.shift))
+    kept, limits = _bounds(layers, coc, motion)
+    views, level, parents, offsets = scheduled(views, limits, prism, settings, by_wavelength=True)
+    parents = torch.arange(len(views))[:, None].expand_as(level) if parents is None else parents
     ready = [
         Layer(layers[:, k], coc[:, k], None if motion is None else motion[:, k], int(level[:, i].max()) + 1)
         for i, k in enumerate(kept)
@@ -139,12 +109,26 @@ def accumulate_layers(
             if last[key] == v:
                 del copies[key]
             picture = picture + left * rgba
-            if subsamples:
+            if settings.subsamples:
                 visible = left * rgba[:, 3:]
                 # Where nothing is seen, the last layer stands for it: no surface in focus that hides what is blurred
                 front = torch.where(visible >= most_seen, radius, front)
                 most_seen = torch.maximum(most_seen, visible)
             left = left * (1 - rgba[:, 3:])
-        picture = subsample_blur(picture, front, offsets.to(picture)) if subsamples else picture
+        picture = subsample_blur(picture, front, offsets.to(picture)) if settings.subsamples else picture
         total = total + (picture if prism is None else picture * prism.weights[v].to(picture)[:, None, None])
     return total / len(views) if prism is None else total
+
+
+@torch.no_grad()
+def _bounds(layers: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[list[int], Bounds]:
+    """Which layers hold anything, and the bounds of those."""
+    there = layers[:, :, 3:] > 0
+    low = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1).double().cpu()
+    high = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1).double().cpu()
+    speed = torch.zeros_like(low)
+    if motion is not None:
+        speed = (motion.norm(dim=2, keepdim=True) * there).movedim(1, 0).flatten(1).amax(1).double().cpu()
+    kept = (low <= high).nonzero()[:, 0].tolist()
+    coarsest = torch.full((len(kept),), min(LEVELS, max(layers.shape[3:]).bit_length()) - 1, dtype=low.dtype)
+    return kept, Bounds(low[kept], high[kept], speed[kept], torch.ones_like(coarsest), coarsest)

@@ -8,10 +8,8 @@ from torch.nn import functional as F
 
 from torchbokeh.lens import Lens
 from torchbokeh.lens.field_map import Field
+from torchbokeh.picture.sensor import STEPS
 from torchbokeh.views.points import Views
-
-STEPS = 4
-"""Steps to the place that a view moves to a pixel; each leaves an error smaller by the slope of the movement."""
 
 
 class Prism:
@@ -79,5 +77,5 @@ class Prism:
             radius = F.grid_sample(coc, grid[None], mode="nearest", padding_mode="border", align_corners=False)[0]
             # Where the middle of the lens sees what this view shows there.
             pinhole = here - radius * point[:, None, None] - shift[:, None, None]
-            here = goal - self.movement(view, point, Field.of(pinhole[0], pinhole[1], self.size))
+            here = goal - self.movement(view, point, Field(pinhole[0], pinhole[1], self.size))
         return 2 * here.movedim(0, -1) / extent

@@ -7,18 +7,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.compose.surfaces import (
-    FOREGROUND,
-    SPACING,
-    Surface,
-    bin_centres,
-    bin_weights,
-    blurred,
-    compose,
-    continued,
-    split_foreground,
-)
+from torchbokeh.compose.composition import blurred, compose
+from torchbokeh.compose.surfaces import Surface, continued, split_foreground
+from torchbokeh.ops.composite import bin_weights
 from torchbokeh.ops.spans import Profile, subdivide
+from torchbokeh.plan.bins import FOREGROUND, SPACING, bin_centres
+from torchbokeh.plan.quality import Detail
 from torchbokeh.psfs import Disc
 
 F32, F64 = torch.float32, torch.float64
@@ -281,7 +275,7 @@ def test_more_sub_apertures_come_closer_to_what_a_lens_sees() -> None:
 
 
 def test_an_opaque_surface_stops_all_light_and_thins_out_at_the_border() -> None:
-    colour, stopped, density = blurred(surface(grey(0.5), 10.0), lens(3)[0])
+    colour, stopped, density = blurred(surface(grey(0.5), 10.0), lens(3)[0], Detail())
     assert torch.equal(stopped, torch.ones_like(stopped))
     assert torch.allclose(density[..., 12:28, 12:44], torch.ones(1, 1, 16, 32))
     assert density.min() < 1e-6  # this piece of the lens looks over the border from the corner of the picture
@@ -289,7 +283,7 @@ def test_an_opaque_surface_stops_all_light_and_thins_out_at_the_border() -> None
 
 
 def test_a_surface_with_holes_stops_what_it_covers() -> None:
-    colour, stopped, density = blurred(surface(grey(3.0), 6.0, grey(0.25)), lens(1)[0])
+    colour, stopped, density = blurred(surface(grey(3.0), 6.0, grey(0.25)), lens(1)[0], Detail())
     assert torch.allclose(stopped, grey(0.25), atol=1e-5)
     assert torch.allclose(colour, grey(3.0), rtol=1e-5)
     assert torch.allclose(density[..., 8:32, 8:48], torch.ones(1, 1, 24, 40))

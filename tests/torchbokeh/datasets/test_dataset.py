@@ -161,7 +161,7 @@ def test_target_and_picture_are_those_of_the_scene(name: str, monkeypatch: pytes
     for key in ("image", "depth", "motion", "layers", "layer_depth", "layer_motion"):
         assert torch.equal(sample[key], seen[key])
     assert args[1] == (H, W)
-    assert all(torch.equal(sample["lens"][k], v) for k, v in camera.lens._values().items())
+    assert all(torch.equal(sample["lens"][k], v) for k, v in camera.lens.values().items())
     # It converges to the exact picture, of which the pinhole picture is no part.
     exact = AccumulationBuffer(views=2048)(scene, camera)[0, :3]
     fine = small(recipes=(name,), views=512)[2]["target"]

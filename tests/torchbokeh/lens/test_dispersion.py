@@ -153,7 +153,7 @@ def test_short_waves_make_larger_pictures(lateral_map: FieldMap | None) -> None:
     for wavelength in LIGHT:
         found = dispersion.enlargement(wavelength, field)
         torch.testing.assert_close(found, 0.03 * (650 - wavelength) / 650 * share, rtol=1e-12, atol=1e-16)
-    corner = Dispersion(lateral=0.01).enlargement(475.0, Field.of(double(5), double(3.5), (7, 10)))
+    corner = Dispersion(lateral=0.01).enlargement(475.0, Field(double(5), double(3.5), (7, 10)))
     assert corner.item() == pytest.approx(0.0027, abs=5e-5)  # as its documentation says
 
 

@@ -151,7 +151,7 @@ def test_the_distance_is_one_in_the_corners_of_the_sensor(size: tuple[int, int])
     h, w = size
     x = torch.tensor([w / 2, -w / 2, w / 2, -w / 2, 0, w / 4], dtype=F64)
     y = torch.tensor([h / 2, h / 2, -h / 2, -h / 2, 0, h / 4], dtype=F64)
-    t = Field.of(x, y, size).t
+    t = Field(x, y, size).t
     torch.testing.assert_close(t, torch.tensor([1, 1, 1, 1, 0, 0.5], dtype=F64), rtol=1e-14, atol=0)
     field = Field.pixels(size, 0, torch.zeros((), dtype=F64))
     # The last pixel's centre is half a pixel nearer.
@@ -162,7 +162,7 @@ def test_the_distance_is_one_in_the_corners_of_the_sensor(size: tuple[int, int])
 
 def test_places_and_angles_follow_the_picture() -> None:
     field = Field.pixels((5, 7), 0, torch.zeros(()))
-    assert all(f.shape == (5, 7) for f in field)
+    assert all(f.shape == (5, 7) for f in (field.x, field.y, field.t, field.theta))
     assert field.x[0].tolist() == [-3, -2, -1, 0, 1, 2, 3]
     assert field.y[:, 0].tolist() == [-2, -1, 0, 1, 2]
     middle = (2, 3)
@@ -180,14 +180,16 @@ def test_places_and_angles_follow_the_picture() -> None:
 def test_a_margin_lies_beyond_the_corners(margin: int) -> None:
     inner = Field.pixels((9, 14), 0, torch.zeros((), dtype=F64))
     outer = Field.pixels((9 + 2 * margin, 14 + 2 * margin), margin, torch.zeros((), dtype=F64))
-    for have, want in zip(outer, inner, strict=True):
+    for name in ("x", "y", "t", "theta"):
+        have, want = getattr(outer, name), getattr(inner, name)
         torch.testing.assert_close(have[margin:-margin, margin:-margin], want, rtol=1e-14, atol=1e-14)
     assert outer.t[0, 0] > 1
 
 
 def test_gradients_are_finite_in_the_middle_of_an_odd_picture() -> None:
-    x, y = (t.clone().requires_grad_() for t in Field.pixels((5, 7), 0, torch.zeros((), dtype=F64))[:2])
-    field = Field.of(x, y, (5, 7))
+    pixels = Field.pixels((5, 7), 0, torch.zeros((), dtype=F64))
+    x, y = (t.clone().requires_grad_() for t in (pixels.x, pixels.y))
+    field = Field(x, y, (5, 7))
     slopes = [torch.autograd.grad(f.sum(), (x, y), retain_graph=True) for f in (field.t, field.theta)]
     assert all(g.isfinite().all() for pair in slopes for g in pair)
     (tx, ty), (ax, ay) = slopes

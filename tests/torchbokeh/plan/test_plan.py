@@ -7,7 +7,7 @@ from torch import Tensor
 
 import torchbokeh as tb
 from torchbokeh import KernelSplatting, LensBlur, Plan
-from torchbokeh.compose.surfaces import FOREGROUND, SPACING
+from torchbokeh.plan.bins import FOREGROUND, SPACING
 from torchbokeh.plan.quality import QUALITIES
 
 

@@ -8,9 +8,11 @@ from torch.nn import functional as F
 
 import torchbokeh as tb
 from torchbokeh.ops.dense import dense_spans
+from torchbokeh.picture.sensor import STEPS
 from torchbokeh.psfs import Ellipse
-from torchbokeh.views.layers import STEPS, Layer, accumulate_layers
+from torchbokeh.views.layers import Layer, accumulate_layers
 from torchbokeh.views.points import Views, shared_views
+from torchbokeh.views.setup import ViewSettings
 
 F32, F64 = torch.float32, torch.float64
 TECHNIQUES: list[dict[str, Any]] = [{}, {"level_of_detail": 0.5}, {"reuse": 1}, {"reuse": 2}, {"subsamples": 4}]
@@ -271,8 +273,7 @@ def test_reuse_is_the_parents_view_rendered_once(grid: int, monkeypatch: pytest.
     parents = shared_views(views, torch.tensor([-1.7], dtype=F32).double(), way, grid, level)[:, 0]
     assert 4 < len(parents.unique()) < n
     own = Views(views.lens[parents], views.time[parents], views.shift)
-    off: dict[str, Any] = {"level_of_detail": 0.0, "reuse": 0, "subsamples": 0}
-    want = accumulate_layers(layers, coc, motion, own, **off)
+    want = accumulate_layers(layers, coc, motion, own, None, ViewSettings())
     calls, original = [], Layer.view
 
     def counted(self: Layer, *rest: Any) -> tuple[Tensor, Tensor]:

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 import torchbokeh.views.cards as module
+import torchbokeh.views.setup as setup
 from torchbokeh import AccumulationBuffer, ThinLens
 from torchbokeh.psfs import Ellipse
 from torchbokeh.scenes import Backdrop, Camera, Scene, Sprite
 from torchbokeh.views.points import Views, shared_views
+from torchbokeh.views.setup import ViewSettings
 
 # pytest puts no folder on the path: the helper beside this file is loaded by its place.
-spec = importlib.util.spec_from_file_location("scene_tracer", Path(__file__).with_name("_tracer.py"))
+spec = importlib.util.spec_from_file_location("scene_tracer", Path(__file__).parents[1] / "scenes" / "_tracer.py")
 tracer = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(tracer)
 
@@ -149,7 +151,7 @@ def test_halves_of_the_sequence_agree_better_than_random_ones() -> None:
         )
         for _ in range(8)
     ]
-    pictures = [module.accumulate_scene(scene, look, views, **OFF) for views in random]
+    pictures = [module.accumulate_scene(scene, look, views, None, ViewSettings()) for views in random]
     apart = np.median([rms(a, b) for a, b in zip(pictures[::2], pictures[1::2], strict=True)])
     assert rms(first, second) < 0.7 * apart
 
@@ -317,10 +319,10 @@ def test_level_of_detail_does_not_pop(monkeypatch: pytest.MonkeyPatch) -> None:
     # The focus is pulled in small steps, through the levels 2.4 to 3.1 of a card of noise.
     scene = Scene((Sprite(texture(4, 64, 64, 0, 1.0), (0.0, 0.0, 2.0), (1.0, 1.0)),), Backdrop(plain(0.1, 0.1, 0.1)))
     mean_levels: list[float] = []
-    split = module.detail_levels
+    split = setup.detail_levels
 
     def steps(levels) -> list[float]:
-        monkeypatch.setattr(module, "detail_levels", levels)
+        monkeypatch.setattr(setup, "detail_levels", levels)
         mean_levels.clear()
         focus = np.linspace(1.4, 1.05, 41)
         pictures = [AccumulationBuffer(views=128, level_of_detail=1.0)(scene, camera(0.3, f)) for f in focus]

@@ -205,7 +205,7 @@ def test_a_dot_in_a_scene(strength: dict[str, Any], depth: float) -> None:
     # The texture's spot is 3 x 3 px: a square's variance beside the disc's.
     want = [math.sqrt(r * r + 2 * 2 * (9 - 1) / 12) for r in coc]
     assert [radius(channel) for channel in out[:3]] == pytest.approx(want, abs=0.35)
-    field = Field.of(torch.tensor(x), torch.tensor(y), (SIDE, SIDE))
+    field = Field(torch.tensor(x), torch.tensor(y), (SIDE, SIDE))
     for k, wavelength in enumerate(RGB):
         larger = 1 + float(dispersion.enlargement(wavelength, field))
         assert place(out[k]) == pytest.approx((x * larger, y * larger), abs=0.25)

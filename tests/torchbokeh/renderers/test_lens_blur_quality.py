@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh as tb
-from torchbokeh.compose.surfaces import COARSE, compose, foreground_over_rest, split_foreground
+from torchbokeh.compose.composition import compose
+from torchbokeh.compose.foreground import foreground_over_rest
+from torchbokeh.compose.surfaces import COARSE, split_foreground
 from torchbokeh.ops.kernels import foreground as _foreground_kernels
 from torchbokeh.plan.quality import QUALITIES
 
@@ -39,12 +41,9 @@ def test_fused_passes_equal_the_composition(size: tuple[int, int, int, int], qua
     blur = tb.LensBlur(quality=quality)
     plan = blur.plan(image, coc=coc)
     assert plan.hidden == "filled"
-    profile, merging = blur.aperture.profile(), plan.quality.merging
-    assert merging is not None
-    want, _ = compose(
-        split_foreground(image, coc, None, plan.bins, COARSE), [profile], merging, plan.highest, coarse=True
-    )
-    got = foreground_over_rest(image, coc, plan.bins, profile, merging, plan.highest)
+    profile = blur.aperture.profile()
+    want, _ = compose(split_foreground(image, coc, None, plan.bins, COARSE), [profile], plan.detail)
+    got = foreground_over_rest(image, coc, plan.bins, profile, plan.detail)
     assert (got - want).abs().max() < 1e-4 * want.abs().max()
     torch.testing.assert_close(blur(image, coc=coc), got, rtol=0, atol=0)
 

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from torchbokeh import AccumulationBuffer, KernelSplatting, ThinLens
+from torchbokeh.picture.samples import Samples, pinhole_position
 from torchbokeh.psfs import PsfBank
 from torchbokeh.psfs.combined import capsule
-from torchbokeh.renderers.reconstruction import Samples, pinhole_position, reconstruct
+from torchbokeh.renderers.reconstruction import reconstruct
 from torchbokeh.report.measure import errors
 from torchbokeh.scenes import Backdrop, Camera, Scene, Sprite, samples, whirl
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh import AccumulationBuffer, ThinLens
-from torchbokeh.renderers.reconstruction import Samples, pinhole_position
+from torchbokeh.picture.samples import Samples, pinhole_position
 from torchbokeh.scenes import Backdrop, Camera, Scene, Sprite, samples
 
 SHUTTER, DOT = 1 / 50, 0.01

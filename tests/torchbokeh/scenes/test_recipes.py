@@ -28,7 +28,7 @@ def numbers(scene: Scene, camera: Camera) -> Tensor:
     for s in scene.sprites:
         rows = (*s.position, *s.size, *s.rotation, *s.velocity, *s.angular_velocity, s.emission)
         parts += [s.texture.flatten(), torch.tensor(rows)]
-    parts += [torch.stack(list(camera.lens._values().values())), torch.tensor([*camera.size, camera.shutter])]
+    parts += [torch.stack(list(camera.lens.values().values())), torch.tensor([*camera.size, camera.shutter])]
     return torch.cat([p.double() for p in parts])
 
 

@@ -36,7 +36,7 @@ PEAK, WIDTH, SAMPLES = 480.0, 20.0, 64
 def dispersing(camera: Camera, spectrum: str, axial: float, lateral: float) -> Camera:
     """The same camera with a lens of BK7 that disperses."""
     dispersion = torchbokeh.Dispersion("BK7", axial, lateral, spectrum=spectrum)  # type: ignore[arg-type]
-    return replace(camera, lens=torchbokeh.ThinLens(**camera.lens._values(), dispersion=dispersion))
+    return replace(camera, lens=torchbokeh.ThinLens(**camera.lens.values(), dispersion=dispersion))
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def lens_rows(side: int) -> Iterator[Row]:
             depth = near.to(precision.dtype)
             depth = torch.where(depth.isinf() & ~near.isinf(), torch.finfo(precision.dtype).max, depth)
             coc = lens.coc(depth, side).double()
-            f, n, df, sensor = (t.double() for t in lens._values().values())
+            f, n, df, sensor = (t.double() for t in lens.values().values())
             d = depth.double()
             gain = f * f / (2 * n) / (1 - f / df) * side / sensor
             want = gain * (1 / df - 1 / d)

@@ -67,4 +67,4 @@ def _in_double(scene: Scene) -> Scene:
 def _dispersing(camera: Camera, spectrum: str) -> Camera:
     """The same camera with the glass of its lens."""
     dispersion = Dispersion("BK7", lateral=0.02, spectrum=spectrum)  # type: ignore[arg-type]
-    return replace(camera, lens=ThinLens(*camera.lens._values().values(), dispersion=dispersion))
+    return replace(camera, lens=ThinLens(*camera.lens.values().values(), dispersion=dispersion))

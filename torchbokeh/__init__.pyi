@@ -1,0 +1,30 @@
+from . import datasets as datasets
+from . import lens as lens
+from . import ops as ops
+from . import psfs as psfs
+from . import scenes as scenes
+from .learn.export import export_onnx as export_onnx
+from .learn.integration import FFTIntegrator as FFTIntegrator
+from .learn.integration import PyramidIntegrator as PyramidIntegrator
+from .learn.integration import ScanlineIntegrator as ScanlineIntegrator
+from .lens import DisparityLens as DisparityLens
+from .lens import Dispersion as Dispersion
+from .lens import FieldMap as FieldMap
+from .lens import Lens as Lens
+from .lens import ThinLens as ThinLens
+from .picture import Samples as Samples
+from .picture import pinhole_position as pinhole_position
+from .plan import Plan as Plan
+from .plan import SplattingPlan as SplattingPlan
+from .psfs import Aperture as Aperture
+from .psfs import Disc as Disc
+from .psfs import Ellipse as Ellipse
+from .psfs import Polygon as Polygon
+from .psfs import PsfBank as PsfBank
+from .renderers.accumulation import AccumulationBuffer as AccumulationBuffer
+from .renderers.chromatic import ChromaticAccumulation as ChromaticAccumulation
+from .renderers.kernel_splatting import KernelSplatting as KernelSplatting
+from .renderers.lens_blur import LensBlur as LensBlur
+from .renderers.reconstruction import reconstruct as reconstruct
+
+__version__: str

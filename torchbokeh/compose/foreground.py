@@ -1,0 +1,70 @@
+"""A foreground over the rest of a plain picture, in few passes: CPU float32, without gradients."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchbokeh.compose.composition import CERTAIN
+from torchbokeh.compose.density import BEYOND, half_density
+from torchbokeh.compose.surfaces import fill_hidden
+from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.merge import Merging
+from torchbokeh.ops.spans import Profile
+from torchbokeh.ops.surface import blur_surface
+from torchbokeh.plan.bins import FOREGROUND
+from torchbokeh.plan.quality import Detail
+
+Bins = Sequence[tuple[float, ...]]
+
+
+def foreground_over_rest(image: Tensor, coc: Tensor, bins: Bins, profile: Profile, detail: Detail) -> Tensor:
+    """`compose` of `split_foreground` in blocks for the whole lens, where pixels are merged.
+
+    Args:
+        image: ``(B, C, H, W)``, at most three channels.
+        coc: ``(B, 1, H, W)`` signed radius in px.
+        bins: centres of those of the foreground and of the rest.
+        profile: the unit shape of the PSF.
+        detail: how far pixels are merged.
+    """
+    assert detail.merging is not None
+    return _foreground_over_rest_op(image, coc, *bins, list(profile), list(detail.merging), detail.highest)
+
+
+@torch.library.custom_op("torchbokeh::foreground_over_rest", mutates_args=())
+def _foreground_over_rest_op(
+    image: Tensor,
+    coc: Tensor,
+    ahead: Sequence[float],
+    behind: Sequence[float],
+    profile: Sequence[Tensor],
+    merging: Sequence[float],
+    highest: int,
+) -> Tensor:
+    from torchbokeh.ops.kernels import foreground as kernels
+
+    settings = Profile(*profile), Merging(*merging), highest
+    out = torch.empty_like(image)
+    for n in range(len(image)):
+        scene = image[n].numpy(), coc[n, 0].numpy()
+        front, known, means = kernels.split(*scene, *FOREGROUND)
+        parts = torch.from_numpy(means)[None].split([1, 1, 1, 1, image.shape[1]], 1)
+        share, total_coc, here, total_here, totals = parts
+        known_share = share.clamp_min(TINY)
+        hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
+        rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
+        picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
+        rest_picture, density = blur_surface(picture, None, radius, behind, *settings)
+        alpha = torch.from_numpy(front)[None, None]
+        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], ahead, *settings)
+        half = half_density(here, total_here, settings[0], Detail(*settings[1:]))
+        planes = (t.contiguous().numpy() for t in (half[0, 0], rest_picture[0], density[0, 0]))
+        kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
+        out[n] = rest_picture[0]
+    return out
+
+
+@_foreground_over_rest_op.register_fake
+def _(image: Tensor, *settings: object) -> Tensor:
+    return torch.empty_like(image, memory_format=torch.contiguous_format)

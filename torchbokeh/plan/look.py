@@ -1,0 +1,126 @@
+"""A look at a scene: the numbers that a plan is decided by."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchbokeh.ops.spans import working_dtype
+from torchbokeh.picture.motion import Motion
+from torchbokeh.picture.request import Request
+from torchbokeh.plan.quality import QUALITIES, merged_shares
+from torchbokeh.psfs.combined import STILL
+
+
+class PlanSettings(NamedTuple):
+    """Settings that a plan keeps to, see `torchbokeh.LensBlur`; None stands for ``"auto"``."""
+
+    quality: str
+    tolerance: float | None
+    layers: int | None
+    subapertures: int | None
+    aperture: str
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a look at a scene finds, as numbers.
+
+    Attributes:
+        size: ``(H, W)`` of the image.
+        low: smallest signed CoC in px after ``max_coc``, of the picture or of each layer that holds anything.
+        high: largest, likewise.
+        clamped: share of the pixels whose radius ``max_coc`` cut.
+        shares: those of `torchbokeh.plan.quality.merged_shares`.
+        layer_count: number of input layers; 0 for a plain image.
+        layers: indices of those that hold anything.
+        opaque: indices of those that cover everything: their coverage needs no looking at.
+        background: whether what the foreground hides is known.
+        motion: longest displacement in px over the open shutter.
+        pan: the displacement (dx, dy) that all pixels share; None where they do not.
+        approach: largest change of a signed radius in px while the shutter is open.
+    """
+
+    size: tuple[int, int]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    clamped: float
+    shares: tuple[float, ...]
+    layer_count: int = 0
+    layers: tuple[int, ...] = ()
+    opaque: tuple[int, ...] = ()
+    background: bool = False
+    motion: float = 0.0
+    pan: tuple[float, float] | None = None
+    approach: float = 0.0
+
+    @property
+    def coc_range(self) -> tuple[float, float]:
+        """Smallest and largest signed CoC of all, in px."""
+        return min(self.low, default=0.0), max(self.high, default=0.0)
+
+    @property
+    def approaches(self) -> bool:
+        """Whether motion toward the camera, or away, is to be seen."""
+        return self.approach > STILL[0]
+
+    @property
+    def moves(self) -> bool:
+        """Whether motion is to be seen."""
+        return self.motion > STILL[0] or self.approaches
+
+
+@torch.no_grad()
+def look_at(request: Request, settings: PlanSettings) -> Look:
+    """Look at a picture, or at layers, with one small copy from the device, and at its motion with another."""
+    image, coc = request.image, request.coc
+    if image.numel() == 0:
+        raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
+    size, background = (image.shape[-2], image.shape[-1]), request.background is not None
+    moved = _look_at_motion(image, request.motion)
+    if not request.layered:
+        clamped = coc.new_zeros(()) if request.clamped is None else request.clamped.to(coc.dtype).mean()
+        found = [*coc.aminmax(), clamped, *merged_shares(coc, settings.quality, settings.tolerance)]
+        low, high, share, *shares = torch.stack(found).tolist()
+        return Look(size, (low,), (high,), share, tuple(shares), 0, (), (), background, *moved)
+    there = image[:, :, 3:] > 0
+    lows = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1)
+    highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
+    cut = request.clamped
+    clamped = lows.new_zeros(()) if cut is None else (cut & there).sum() / there.sum().clamp_min(1)
+    merging = merged_shares(torch.where(there, coc, 0.0), settings.quality, settings.tolerance)
+    least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(lows.dtype)
+    numbers = torch.cat([lows, highs, least, torch.stack([clamped.to(lows.dtype), *merging])]).tolist()
+    bounds, (share, *shares) = numbers[: -len(QUALITIES) - 1], numbers[-len(QUALITIES) - 1 :]
+    count = image.shape[1]
+    kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
+    opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
+    ends = tuple(bounds[k] for k in kept), tuple(bounds[count + k] for k in kept)
+    return Look(size, *ends, share, tuple(shares), count, kept, opaque, background, *moved)
+
+
+def _look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, float] | None, float]:
+    """`Look.motion`, `Look.pan` and `Look.approach`.
+
+    Raises:
+        ValueError: the motion is not finite.
+    """
+    if not motion:
+        return 0.0, None, 0.0
+    found, ends = motion.displacements, motion.shutter_coc
+    work = working_dtype(image.device)  # in half precision the square of 300 px is infinite already
+    numbers = [image.new_zeros(1) if ends is None else ends.diff(dim=-3).abs().max()[None]]
+    if found:
+        length = torch.stack([d.to(work).square().sum(-3) for d in found]).sqrt().sum(0).max()
+        numbers += [length[None], *found[0].movedim(-3, 0).flatten(1).aminmax(dim=1)]
+    approach, *rest = torch.cat([t.to(image.device, work) for t in numbers]).tolist()
+    if not rest:
+        return 0.0, None, approach
+    longest, *limits = rest
+    if not math.isfinite(longest):
+        bad = sum(int((~d.isfinite()).sum()) for d in found)
+        raise ValueError(f"motion: expected finite values, got {bad} that are not")
+    same = len(found) == 1 and limits[:2] == limits[2:]
+    return longest, (limits[0], limits[1]) if same else None, approach
