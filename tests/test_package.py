@@ -2,7 +2,6 @@
 
 import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -87,17 +86,6 @@ def test_installed_wheel_is_imported_whole(wheel: Path, tmp_path: Path) -> None:
 def test_import_leaves_rare_packages_alone(tmp_path: Path) -> None:
     code = f"import sys, torchbokeh; print(*(m for m in {LAZY} if m in sys.modules))"
     assert _output("-c", code, cwd=tmp_path).split() == []
-
-
-@pytest.mark.slow
-def test_readme_examples_run(tmp_path: Path) -> None:
-    """One after the other: the later ones take the imports from the first."""
-    examples = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    for example in examples:
-        compile(example, "README.md", "exec")
-    examples = [example for example in examples if "torchvision" not in example]  # it is not installed
-    assert examples
-    _output("-W", "error", "-c", "\n".join(examples), cwd=tmp_path)
 
 
 def test_source_folder_alone_says_what_to_do(tmp_path: Path) -> None:
