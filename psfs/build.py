@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from torchbokeh.ops.checks import check_whole
 from torchbokeh.ops.system.files import replacing
 from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
 from torchbokeh.psfs.bank import PsfBank
@@ -84,10 +85,10 @@ def build(
     Raises:
         ChildProcessError: a worker was killed.
         OSError: a file cannot be written.
+        TypeError: ``workers`` is no int.
         ValueError: ``workers`` is below 1.
     """
-    if workers < 1:
-        raise ValueError(f"workers: expected at least 1, got {workers}")
+    check_whole("workers", workers, 1)
     target = Target(ssim=model.similarity) if target is None else target
     path = Path(path)
     parts = path.with_name(path.name + ".parts")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchbokeh.ops.checks import check_number
+from torchbokeh.ops.checks import check_finite, check_number
 from torchbokeh.ops.sellmeier import refractive_index
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
 from torchbokeh.psfs.tracing import cropped, splat_rays, spread
@@ -192,9 +192,7 @@ class PhysicalLens(PsfModel):
         sensor = {"sensor_width": sensor_width, "width": width}
         lowest = {"f_number": 1.0, "focus_distance": 2 * check_number("focal_length", focal_length)}
         for name, value in (lens | sensor).items():
-            check_number(name, value)
-            if not lowest.get(name, 0.0) < value < math.inf:
-                raise ValueError(f"{name}: expected a finite number above {lowest.get(name, 0.0):g}, got {value}")
+            check_finite(name, value, lowest.get(name, 0.0), above=True)
         if sensor_width > focal_length:
             raise ValueError(f"sensor_width: expected at most the focal length, {focal_length:g}, got {sensor_width:g}")
         self._settings = {"side": side, **lens, **sensor}

@@ -1,18 +1,16 @@
 """Training data without end: pictures, depth, motion and layers with the exact picture a camera would take."""
 
 import operator
-import sys
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.checks import check_size, check_whole, is_number
 from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.scenes._random import check_size, rng
+from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.recipes import RECIPES
 
 MOST_LAYERS = 1024
@@ -69,7 +67,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         rng(seed)
         self.seed = int(seed)
         self.resolution = check_size(resolution, "resolution")
-        self.length = check_whole("length", length, 0, sys.maxsize)
+        self.length = check_whole("length", length, 0)
         names = tuple(RECIPES) if recipes is None else recipes
         if not isinstance(names, Sequence):
             raise TypeError(f"recipes: expected names or None, got {recipes!r}")
@@ -81,7 +79,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             raise ValueError("recipes: expected at least one, got none")
         width = self.resolution[1]
         pair = (0.01 * width, 0.08 * width) if blur is None else blur
-        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(r, Real) for r in pair):
+        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(is_number(r) for r in pair):
             raise TypeError(f"blur: expected (smallest, largest) radius in px, got {blur!r}")
         self.blur = float(pair[0]), float(pair[1])
         if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):

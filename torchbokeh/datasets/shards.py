@@ -24,6 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchbokeh.datasets.shard_entries import KEYS, LAYERS, MAPS, SUFFIXES, decoded, entries_of
 from torchbokeh.io.pictures import replacing
+from torchbokeh.ops.checks import check_whole
 from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
 
 if TYPE_CHECKING:
@@ -88,8 +89,7 @@ def write_shards(
     from tqdm import tqdm
 
     files = shard_indices(count, per_shard, shard)
-    if workers < 0:
-        raise ValueError(f"workers: expected at least 0, got {workers}")
+    check_whole("workers", workers, 0)
     length = len(dataset) if hasattr(dataset, "__len__") else count
     if length < count:
         raise ValueError(f"count: expected at most the {length} samples of the dataset, got {count}")
@@ -152,9 +152,8 @@ def shard_indices(count: int, per_shard: int = 100, shard: tuple[int, int] = (1,
         >>> shard_indices(250, per_shard=100, shard=(1, 2))
         {'shard-000000.tar': range(0, 100), 'shard-000002.tar': range(200, 250)}
     """
-    for name, value in (("count", count), ("per_shard", per_shard)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, got {value}")
+    check_whole("count", count, 1)
+    check_whole("per_shard", per_shard, 1)
     k, m = shard
     if not 1 <= k <= m:
         raise ValueError(f"shard: expected (k, m) with 1 <= k <= m, got ({k}, {m})")
@@ -207,8 +206,7 @@ def read_shards(
         import webdataset as wds
     except ImportError:
         raise ImportError("reading shards needs the package webdataset; pip install torchbokeh[data]") from None
-    if shuffle < 0:
-        raise ValueError(f"shuffle: expected at least 0, got {shuffle}")
+    check_whole("shuffle", shuffle, 0)
     keys = (keys,) if isinstance(keys, str) else keys
     unknown = {*(keys or ())} - {*KEYS}
     if unknown:

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchbokeh.scenes._random import check_size
+from torchbokeh.ops.checks import check_size
 
 
 def lattice(size: tuple[int, int], pixels: float, angle: float, margin: int) -> tuple[Tensor, int]:

@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchbokeh.ops.checks import check_size
 from torchbokeh.scenes._paint import draw_contrast
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.scenes._random import count_setting, rng, setting
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont

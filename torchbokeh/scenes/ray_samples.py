@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops.checks import MOST_PIXELS, check_whole
+from torchbokeh.ops.checks import MOST_PIXELS, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.planes import Plates, pixel_centres
 from torchbokeh.ops.sampling import aperture_points
@@ -51,9 +51,8 @@ def samples(scene: Scene, camera: Camera, per_pixel: int = 1, seed: int = 0) -> 
         >>> samples(*scenes.coins(size=(24, 32)), per_pixel=4).colour.shape
         torch.Size([1, 4, 3, 24, 32])
     """
-    for name, value, kind in (("scene", scene, Scene), ("camera", camera, Camera)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+    check_kind("scene", scene, Scene)
+    check_kind("camera", camera, Camera)
     if len(scene) == 0:
         raise ValueError("scene: expected at least one card or a backdrop, got none")
     height, width = camera.size

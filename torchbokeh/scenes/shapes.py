@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.checks import check_image
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_size
+from torchbokeh.scenes._random import count_setting, rng, setting
 from torchbokeh.scenes._raster import fill
 
 if TYPE_CHECKING:
@@ -222,9 +222,7 @@ def grid(
     pitch = setting("pitch", pitch, draw.uniform(0.1, 0.25), 0.02, 1)
     bar = setting("bar", bar, draw.uniform(0.12, 0.3), 0.01, 0.9)
     drawn = bool(draw.integers(2))
-    if not isinstance(diagonal, bool | None):
-        raise TypeError(f"diagonal: expected True or False, got {type(diagonal).__name__}")
-    diagonal = drawn if diagonal is None else diagonal
+    diagonal = drawn if diagonal is None else check_flag("diagonal", diagonal)
     phases = draw.uniform(0, 1, 2)
     step = pitch * min(height, width)
     reach = 0.5 * math.hypot(height, width)
@@ -262,8 +260,7 @@ def glyph(size: tuple[int, int], seed: int = 0, *, characters: str | None = None
     height, width = check_size(size)
     drawn = "ABCDEFGHJKMNPQRSTUVWXYZabdefghkmnqrstwxyz2345678&@#?%"[rng(seed, "glyph").integers(53)]
     characters = drawn if characters is None else characters
-    if not isinstance(characters, str):
-        raise TypeError(f"characters: expected a string, got {type(characters).__name__}")
+    check_kind("characters", characters, str)
     ink = _ink(characters, 256.0) if characters and "\n" not in characters else None
     if ink is None:
         raise ValueError(f"characters: expected something visible on one line, got {characters!r}")

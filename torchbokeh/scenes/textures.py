@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchbokeh.ops.checks import check_size
 from torchbokeh.scenes._paint import draw_contrast, draw_palette, fractal, lattice, linear_hsv, ramp
 from torchbokeh.scenes._pictures import lights, photograph, text
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.scenes._random import count_setting, rng, setting
 from torchbokeh.scenes._raster import fill, stroke
 
 
