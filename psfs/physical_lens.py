@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from torchbokeh.ops.checks import check_finite, check_number
 from torchbokeh.ops.sellmeier import refractive_index
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
 from torchbokeh.psfs.tracing import cropped, splat_rays, spread
-
-Array = NDArray[np.float64]
 
 WAVELENGTHS = (0.650, 0.510, 0.475)
 """Of red, green and blue in micrometres."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchbokeh.ops.checks import check_whole
-from torchbokeh.psfs.refit import Array
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.sparsify import NOISE, check_picture
 
 

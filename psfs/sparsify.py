@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchbokeh.ops.checks import check_finite, check_whole
-from torchbokeh.psfs.refit import Array, Points, Sparse, reconstruction
+from torchbokeh.psfs.arrays import Array, Points
+from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import laplacian as laplacian_of
 from torchbokeh.psfs.represent import nonzero
 from torchbokeh.psfs.similarity import centred, neighbourhood, score

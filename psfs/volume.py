@@ -4,13 +4,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchbokeh.ops.checks import check_finite, check_number
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 from torchbokeh.psfs.tracing import cropped
-
-Array = NDArray[np.float64]
 
 ANISOTROPY = 0.8
 """Mean cosine of the angle by which light is scattered, g."""
