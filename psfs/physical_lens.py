@@ -14,7 +14,7 @@ from torchbokeh.ops.checks import check_finite, check_number
 from torchbokeh.ops.sellmeier import refractive_index
 from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
-from torchbokeh.psfs.tracing import cropped, splat_rays, spread
+from torchbokeh.psfs.tracing import cropped, sobol_points, splat_rays
 
 WAVELENGTHS = (0.650, 0.510, 0.475)
 """Of red, green and blue in micrometres."""
@@ -237,7 +237,7 @@ class PhysicalLens(PsfModel):
 
     def _traced(self, places: Sequence[Sequence[float]]) -> Array:
         """The mean of PSFs. Each gets a part of Sobol's sequence, which fills the stop by itself."""
-        parts = np.split(spread(POWER, SEED), len(places), axis=1)
+        parts = np.split(sobol_points(POWER, SEED), len(places), axis=1)
         picture = np.zeros((3, FRAME, FRAME))
         for part, (coc, eccentricity) in zip(parts, places, strict=True):
             self._light(picture, part, coc, eccentricity)

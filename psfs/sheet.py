@@ -84,6 +84,5 @@ def _framed(picture: Array, tile: int) -> Array:
     if side <= tile:
         out = square[:, pixel][:, :, pixel]
     else:
-        starts = pixel
-        out = np.maximum.reduceat(np.maximum.reduceat(square, starts, 1), starts, 2)
+        out = np.maximum.reduceat(np.maximum.reduceat(square, pixel, 1), pixel, 2)
     return np.pad(out, ((0, 0), (0, GAP), (0, GAP)), constant_values=0.2)

@@ -9,10 +9,7 @@ from torchbokeh.commands.arguments import interval, names, shard, size, whole
 
 
 def add_dataset(parser: argparse.ArgumentParser) -> None:
-    """Add the command's flags to its parser, and :func:`run` as what it does.
-
-    Args:
-        parser: that of the subcommand.
+    """Add the command's flags to the parser of the subcommand, and :func:`run` as what it does.
 
     Example:
         >>> parser = argparse.ArgumentParser()
@@ -40,9 +37,6 @@ def add_dataset(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Write the shards of this machine that are missing, and print how many samples that were and how fast.
-
-    Args:
-        args: what a parser with :func:`add_dataset` made of the command line.
 
     Raises:
         ValueError: as :class:`~torchbokeh.datasets.ProceduralDataset` and

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch.nn.functional import pad
 from torch.utils.data import Dataset
 
 from torchbokeh.ops.checks import check_size, check_whole, is_number
@@ -126,15 +126,10 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             buffer = AccumulationBuffer(**self.target, seed=int(draw.integers(1 << 31)))
             target = buffer(scene, camera)[0, :3]
         for key, empty in (("layers", 0.0), ("layer_depth", torch.inf), ("layer_motion", 0.0)):
-            seen[key] = _filled(seen[key], self.layers, empty)
+            missing = self.layers - len(seen[key])  # all samples share a number of layers
+            seen[key] = pad(seen[key], (0, 0, 0, 0, 0, 0, 0, missing), value=empty)
         for key in ("alpha", "shutter_depth", "layer_shutter_depth"):
             del seen[key]
         lens = {key: value.clone() for key, value in camera.lens._values().items()}
         coc = camera.lens.coc(seen["depth"], self.resolution[1])
         return {**seen, "coc": coc, "target": target, "lens": lens, "recipe": name, "index": index}
-
-
-def _filled(layers: Tensor, count: int, empty: float) -> Tensor:
-    """Layers filled up to a number that all samples share."""
-    missing = layers.new_full((count - len(layers), *layers.shape[1:]), empty)
-    return torch.cat([layers, missing])

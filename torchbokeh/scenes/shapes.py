@@ -1,8 +1,10 @@
 """Shapes: how much of each texel of a card is covered.
 
-Every shape takes the size of the card, a seed, and settings that are drawn from the seed where they are None.
-Its outermost texels are empty, so that a card sampled bilinearly ends in nothing. Outlines are polygons with
-exact area coverage; round ones have 512 corners, off by less than 1/100 texel on cards of up to 1000 texels.
+Every shape takes the size of the card, a seed, and settings that are drawn from the seed where they are None. It
+returns the coverage ``(1, H, W)``, float32 in [0, 1]. It raises a TypeError for an argument of the wrong kind, and a
+ValueError for one out of its range. The outermost texels are empty, so that a card sampled bilinearly ends in nothing.
+Outlines are polygons with exact area coverage; round ones have 512 corners, off by less than 1/100 texel on cards of
+up to 1000 texels.
 """
 
 import math
@@ -28,13 +30,6 @@ def disc(size: tuple[int, int], seed: int = 0) -> Tensor:
         size: (H, W) in texels.
         seed: not used, there is only one disc.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: ``size`` or ``seed`` is not of integers.
-        ValueError: a size below 1 or a negative seed.
-
     Example:
         >>> round(disc((4, 4)).sum().item(), 2)
         3.14
@@ -50,13 +45,6 @@ def ring(size: tuple[int, int], seed: int = 0, *, inner: float | None = None) ->
         size: (H, W) in texels; the outer radius is ``min(H, W) / 2 - 1``.
         seed: draws what is None.
         inner: radius of the hole over the outer radius, 0 to 1.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> ring((9, 9), inner=0.5)[0, 4, 4].item()
@@ -84,13 +72,6 @@ def polygon(
         depth: 0 is the convex polygon; the notches of a star reach from its edges this share of the way to
             the centre, below 1.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
-
     Example:
         >>> polygon((34, 34), corners=4, rotation=0.0, depth=0.0).sum().item()  # 2 r²
         512.0
@@ -112,13 +93,6 @@ def leaf(size: tuple[int, int], seed: int = 0, *, lobes: int | None = None, slen
         seed: draws what is None, and the bend, the teeth along the edge and the rotation.
         lobes: lobes on each side, 0 (entire) to 8, as an oak's.
         slenderness: length over width, 1 to 8.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(leaf((64, 48), seed=3).shape)
@@ -156,13 +130,6 @@ def gear(size: tuple[int, int], seed: int = 0, *, teeth: int | None = None, hole
         seed: draws what is None, the number of spokes (0, or 3 to 6) and the rotation.
         teeth: 4 to 64.
         hole: radius of the hole over the outer radius, 0 to 0.6.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> gear((33, 33), teeth=12, hole=0.2)[0, 16, 16].item()
@@ -206,13 +173,6 @@ def grid(
         bar: width of a bar over the pitch, 0.01 to 0.9.
         diagonal: False for upright and level bars, True for the diamonds of a chain-link fence.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
-
     Example:
         >>> 0.3 < grid((128, 128), pitch=0.25, bar=0.25, diagonal=False).mean() < 0.5
         tensor(True)
@@ -244,13 +204,6 @@ def glyph(size: tuple[int, int], seed: int = 0, *, characters: str | None = None
         seed: draws a single character where none is given.
         characters: what to write, on one line, in Pillow's own font.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: ``characters`` is empty or has nothing to see.
-
     Example:
         >>> tuple(glyph((48, 64), characters="Hi").shape)
         (1, 48, 64)
@@ -281,13 +234,6 @@ def rectangle(size: tuple[int, int], seed: int = 0) -> Tensor:
     Args:
         size: (H, W) in texels.
         seed: not used, there is only one rectangle.
-
-    Returns:
-        ``(1, H, W)`` float32, 0 or 1.
-
-    Raises:
-        TypeError: ``size`` or ``seed`` is not of integers.
-        ValueError: a size below 1 or a negative seed.
 
     Example:
         >>> rectangle((3, 4)).tolist()
@@ -345,9 +291,9 @@ def _ink(characters: str, points: float) -> "Image | None":
     return picture.crop(box) if box else None
 
 
-def _circle(corners: int = 512) -> np.ndarray:
+def _circle() -> np.ndarray:
     """The unit circle."""
-    angle = np.arange(corners) * (2 * math.pi / corners)
+    angle = np.arange(512) * (2 * math.pi / 512)
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
