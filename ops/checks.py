@@ -90,14 +90,7 @@ def check_kind(name: str, value: object, kind: type, *, optional: bool = False) 
 
 
 def check_size(size: Sequence[int], name: str = "size") -> tuple[int, int]:
-    """The height and the width in pixels, both at least 1.
-
-    Args:
-        size: (H, W).
-        name: of the argument, for the message.
-
-    Returns:
-        The two as ints.
+    """The height and the width of a ``size`` (H, W) in pixels, both at least 1.
 
     Raises:
         TypeError: not two integers.

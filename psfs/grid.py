@@ -104,7 +104,9 @@ class NestedGrid:
         Returns:
             Pairs of numbers ``(...)`` and shares ``(...)``, float64.
         """
-        place = torch.minimum(self.remap(coordinates).double(), self._inside(coordinates.device))
+        # The largest place that lies within the grid.
+        edge = torch.tensor(self.cells, dtype=torch.float64, device=coordinates.device) * (1 - 2.0**-52)
+        place = torch.minimum(self.remap(coordinates).double(), edge)
         own = self._at(place.detach())
         corners = self._corners.to(coordinates.device)
         low, high = corners[own].unbind(-2)
@@ -112,7 +114,6 @@ class NestedGrid:
         inside = place.detach()
         forward = torch.where(inside >= middle, 1.0, -1.0)
         beyond = torch.where(forward > 0, high, low - 1e-9)
-        edge = self._inside(coordinates.device)
         there = (beyond >= 0) & (beyond <= edge)
         shares = []
         for axis in range(len(self.cells)):
@@ -131,10 +132,6 @@ class NestedGrid:
                     step[..., axis] = torch.where(there[..., axis], beyond[..., axis], inside[..., axis])
             found.append((self._at(step), weight))
         return found
-
-    def _inside(self, device: torch.device) -> Tensor:
-        """The largest place that lies within the grid."""
-        return torch.tensor(self.cells, dtype=torch.float64, device=device) * (1 - 2.0**-52)
 
     def boxes(self) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
         """Lower and upper corner of every box in grid units, in order: the list that LKS stores."""

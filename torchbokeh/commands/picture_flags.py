@@ -80,12 +80,17 @@ def refuse_unused_flags(args: argparse.Namespace) -> None:
         raise ValueError("--disparity needs --strength, the blur radius in pixels per unit of disparity")
 
 
+def check_same_size(path: Path, values: Tensor, image_path: Path, image: Tensor) -> None:
+    """Raise a ValueError unless a map ``(1, C, H, W)`` that was read has the size of the image."""
+    if values.shape[2:] != image.shape[2:]:
+        (h, w), (ih, iw) = values.shape[2:], image.shape[2:]
+        raise ValueError(f"{path}: is {w} x {h}, but {image_path} is {iw} x {ih}; resize one to the other")
+
+
 def _read_depth(args: argparse.Namespace, image: Tensor) -> Tensor:
     path = args.depth or args.disparity
     values = read_map(path, args.depth_scale or 1.0)
-    if values.shape[2:] != image.shape[2:]:
-        (h, w), (ih, iw) = values.shape[2:], image.shape[2:]
-        raise ValueError(f"{path}: is {w} x {h}, but {args.image} is {iw} x {ih}; resize one to the other")
+    check_same_size(path, values, args.image, image)
     bad = ~(values > 0) if args.depth else ~values.isfinite()
     if bad.any():
         y, x = bad[0, 0].nonzero()[0].tolist()

@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from torchbokeh.commands.arguments import count, finite, stops
-from torchbokeh.commands.picture_flags import add_picture_flags, read_picture, refuse_overwriting, refuse_unused_flags
+from torchbokeh.commands.picture_flags import (
+    add_picture_flags,
+    check_same_size,
+    read_picture,
+    refuse_overwriting,
+    refuse_unused_flags,
+)
 from torchbokeh.io.flow import read_flow
 from torchbokeh.io.pictures import check_writable, write_image
 
@@ -55,7 +61,5 @@ def _read_motion(args: argparse.Namespace, image: Tensor) -> Tensor | None:
     if args.motion is None:
         return None
     motion = read_flow(args.motion)
-    if motion.shape[2:] != image.shape[2:]:
-        (h, w), (ih, iw) = motion.shape[2:], image.shape[2:]
-        raise ValueError(f"{args.motion}: is {w} x {h}, but {args.image} is {iw} x {ih}; they must be of one size")
+    check_same_size(args.motion, motion, args.image, image)
     return motion.to(args.device)

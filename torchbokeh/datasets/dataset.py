@@ -86,11 +86,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
         self.layers = check_whole("layers", layers, 1, MOST_LAYERS)
         buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
-        self.target: dict[str, Any] = {
-            "views": buffer.views,
-            "level_of_detail": buffer.level_of_detail,
-            "reuse": buffer.reuse,
-        }
+        self.target = {name: getattr(buffer, name) for name in ("views", "level_of_detail", "reuse")}
 
     def settings(self) -> dict[str, Any]:
         """All that the samples depend on, for a file beside them."""

@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from torchbokeh.datasets.layout import KEYS, LAYERS, MANIFEST, MAPS, entry_names, read_manifest, shard_indices
-from torchbokeh.io.pictures import replacing
 from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.system.files import make_folder, replacing
 from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
 
 
@@ -87,10 +87,7 @@ def write_shards(
     if length < count:
         raise ValueError(f"count: expected at most the {length} samples of the dataset, got {count}")
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"{out}: cannot be made a folder ({error.strerror}); choose another") from None
+    make_folder(out)
     _check_manifest(out, dataset, count, per_shard)
     missing = {out / name: indices for name, indices in files.items() if not _is_whole(out / name, indices)}
     for path in missing:

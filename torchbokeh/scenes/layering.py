@@ -74,13 +74,9 @@ def flatten(rgba: Tensor, depth: Tensor, way: Tensor) -> tuple[Tensor, Tensor, T
     Returns:
         ``(4, H, W)``, ``(1, H, W)`` and ``(E, H, W)``; where nothing is seen, depth ``inf`` and no way.
     """
-    left = torch.ones_like(rgba[0, 3:]) if len(rgba) else rgba.new_ones(1, *rgba.shape[2:])
-    picture, front, moved = (
-        0 * left.expand(4, -1, -1),
-        torch.full_like(left, torch.inf),
-        0 * left.expand(way.shape[1], -1, -1),
-    )
-    most = 0 * left
+    size = rgba.shape[2:]
+    left, most = rgba.new_ones(1, *size), rgba.new_zeros(1, *size)
+    picture, front, moved = rgba.new_zeros(4, *size), rgba.new_full((1, *size), torch.inf), way.new_zeros(way.shape[1:])
     for colour, z, moves in zip(rgba, depth, way, strict=True):
         visible = left * colour[3:]
         nearer = visible > most

@@ -174,13 +174,7 @@ def brick(
     return torch.lerp(picture, ground, joint).clamp(0, 1)
 
 
-def checker(
-    size: tuple[int, int],
-    seed: int,
-    *,
-    cells: float | None = None,
-    rotation: float | None = None,
-) -> Tensor:
+def checker(size: tuple[int, int], seed: int, *, cells: float | None = None, rotation: float | None = None) -> Tensor:
     """A chessboard of two colours.
 
     Args:
