@@ -123,13 +123,13 @@ class NestedGrid:
             gap = half[..., axis] + (other[..., 1] - other[..., 0]) / 2
             far = (place[..., axis] - middle[..., axis]).abs() / gap
             shares.append(torch.where(there[..., axis], far, 0.0))
+        across = torch.where(there, beyond, inside)
         found = []
         for picked in product((False, True), repeat=len(self.cells)):
-            step, weight = inside.clone(), torch.ones_like(place[..., 0])
-            for axis, taken in enumerate(picked):
-                weight = weight * (shares[axis] if taken else 1 - shares[axis])
-                if taken:
-                    step[..., axis] = torch.where(there[..., axis], beyond[..., axis], inside[..., axis])
+            weight = torch.ones_like(place[..., 0])
+            for taken, share in zip(picked, shares, strict=True):
+                weight = weight * (share if taken else 1 - share)
+            step = torch.where(torch.tensor(picked, device=place.device), across, inside)
             found.append((self._at(step), weight))
         return found
 

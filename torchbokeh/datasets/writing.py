@@ -184,23 +184,20 @@ def _check_manifest(out: Path, dataset: Dataset[dict[str, Any]], count: int, per
     path = out / MANIFEST
     # In this order: another machine that has just begun writes its manifest before its first file.
     has_shards = any(out.glob("shard-*.tar"))
-    if not path.exists():
-        if has_shards:
-            raise ValueError(f"{out}: holds shards, but no {MANIFEST} that says of what; choose another folder")
-        with replacing(path) as temporary:  # machines that begin together write the same
-            temporary.write_text(text, encoding="utf-8")
-        return
-    found, wanted = read_manifest(path), json.loads(text)
-    before, now = ({**manifest, **manifest["settings"]} for manifest in (found, wanted))
-    differing = [name for name in {**before, **now} if name != "settings" and before.get(name) != now.get(name)]
-    if differing and not has_shards and not any(out.glob(".shard-*.tmp")):
-        with replacing(path) as temporary:  # a run that failed before its first file holds nobody back
-            temporary.write_text(text, encoding="utf-8")
-    elif differing:
-        what = ", ".join(
-            f"{name} {json.dumps(before.get(name))}, not {json.dumps(now.get(name))}" for name in differing
-        )
-        raise ValueError(f"{out}: was begun with {what}; go on with the same settings or choose another folder")
+    if path.exists():
+        found, wanted = read_manifest(path), json.loads(text)
+        before, now = ({**manifest, **manifest["settings"]} for manifest in (found, wanted))
+        differing = [name for name in {**before, **now} if name != "settings" and before.get(name) != now.get(name)]
+        if not differing:
+            return
+        if has_shards or any(out.glob(".shard-*.tmp")):  # a run that failed before its first file holds nobody back
+            pairs = (f"{name} {json.dumps(before.get(name))}, not {json.dumps(now.get(name))}" for name in differing)
+            what = ", ".join(pairs)
+            raise ValueError(f"{out}: was begun with {what}; go on with the same settings or choose another folder")
+    elif has_shards:
+        raise ValueError(f"{out}: holds shards, but no {MANIFEST} that says of what; choose another folder")
+    with replacing(path) as temporary:  # machines that begin together write the same
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _is_whole(path: Path, indices: range) -> bool:

@@ -52,8 +52,6 @@ def text(size: tuple[int, int], seed: int, *, points: float | None = None, words
     """A printed page: lines of words, some of them large.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         points: height of the small print over the longer side, 0.01 to 1.
         words: what to write over and over, at least one visible character.
 
@@ -126,8 +124,6 @@ def lights(size: tuple[int, int], seed: int, *, count: int | None = None, peak: 
     """A town at night: lit windows and lamps far brighter than 1 on dark ground.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         count: number of lamps, 1 to 10000; windows come on top.
         peak: the largest radiance, 1 to 1e6; None draws 10 to 100. Lamps range from a tenth of it upwards, windows
             up to a fifth.

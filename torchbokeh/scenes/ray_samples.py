@@ -100,7 +100,7 @@ def _hits(scene: Scene, plates: Plates, camera: Camera, rays: Tensor) -> Tensor:
 
     found = chosen(rgba)
     coc = camera.lens.coc(chosen(depth[..., None]).to(camera.lens.focus_distance), camera.size[1]).to(found)
-    motion = _ways(scene, camera, card[:, 0], chosen(texel))
+    motion = _motion(scene, camera, card[:, 0], chosen(texel))
     return torch.cat([hit.double(), found[:, :3] / found[:, 3:].clamp_min(TINY), coc, motion], 1)
 
 
@@ -123,7 +123,7 @@ def _first(alpha: Tensor, depth: Tensor, number: Tensor) -> tuple[Tensor, Tensor
     return order.gather(1, stopped.int().argmax(1, keepdim=True)), stopped.any(1, keepdim=True)
 
 
-def _ways(scene: Scene, camera: Camera, card: Tensor, texel: Tensor) -> Tensor:
+def _motion(scene: Scene, camera: Camera, card: Tensor, texel: Tensor) -> Tensor:
     """The way ``(N, 2)`` in px of texels ``(N, 3)`` of their cards ``(N,)`` while the shutter is open."""
     middle = torch.zeros(2, 2, dtype=torch.float64)
     matrices = scene.homographies(camera, middle, torch.tensor([-0.5, 0.5], dtype=torch.float64), middle)

@@ -146,8 +146,8 @@ class Scene:
             level = torch.full((len(grid), 1), lod)
             rgba, _ = render_planes(one, inverse3(several)[:, None], level, (bottom - top, right - left))
             if bool((rgba[0, 3] > 0).any()):
-                depth, way = _geometry(three, rgba, one)
-                found.append(Fragments(top, left, rgba[0], depth, way))
+                depth, motion = _geometry(three, rgba, one)
+                found.append(Fragments(top, left, rgba[0], depth, motion))
         return found
 
 
@@ -182,7 +182,7 @@ def _corners(height: float, width: float, rim: float = 0.0) -> Tensor:
 
 
 def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Tensor]:
-    """Depth and way of a card at the centres of the pixels, from its homographies half way, before and after."""
+    """Depth and motion of a card at the centres of the pixels, from its homographies half way, before and after."""
     h, w = rgba.shape[2:]
     if plate.infinite[0]:
         return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(4, h, w)

@@ -1,10 +1,10 @@
 """Shapes: how much of each texel of a card is covered.
 
-Every shape takes the size of the card, a seed, and settings that are drawn from the seed where they are None. It
-returns the coverage ``(1, H, W)``, float32 in [0, 1]. It raises a TypeError for an argument of the wrong kind, and a
-ValueError for one out of its range. The outermost texels are empty, so that a card sampled bilinearly ends in nothing.
-Outlines are polygons with exact area coverage; round ones have 512 corners, off by less than 1/100 texel on cards of
-up to 1000 texels.
+Every shape takes the size (H, W) of the card in texels, a seed, and settings that are drawn from the seed where they
+are None. It returns the coverage ``(1, H, W)``, float32 in [0, 1]. It raises a TypeError for an argument of the wrong
+kind, and a ValueError for one out of its range. The outermost texels are empty, so that a card sampled bilinearly ends
+in nothing. Outlines are polygons with exact area coverage; round ones have 512 corners, off by less than 1/100 texel on
+cards of up to 1000 texels.
 """
 
 import math
@@ -27,7 +27,6 @@ def disc(size: tuple[int, int], seed: int = 0) -> Tensor:
     """A disc in the middle of the card; its radius is ``min(H, W) / 2 - 1`` texels.
 
     Args:
-        size: (H, W) in texels.
         seed: not used, there is only one disc.
 
     Example:
@@ -43,7 +42,6 @@ def ring(size: tuple[int, int], seed: int = 0, *, inner: float | None = None) ->
 
     Args:
         size: (H, W) in texels; the outer radius is ``min(H, W) / 2 - 1``.
-        seed: draws what is None.
         inner: radius of the hole over the outer radius, 0 to 1.
 
     Example:
@@ -167,7 +165,6 @@ def grid(
     """A lattice over the whole card: bars, or a diagonal wire fence.
 
     Args:
-        size: (H, W) in texels.
         seed: draws what is None, and the phase.
         pitch: distance between bars over the shorter side of the card, 0.02 to 1.
         bar: width of a bar over the pitch, 0.01 to 0.9.
@@ -200,7 +197,6 @@ def glyph(size: tuple[int, int], seed: int = 0, *, characters: str | None = None
     """Letters, as large as fit into the card.
 
     Args:
-        size: (H, W) in texels.
         seed: draws a single character where none is given.
         characters: what to write, on one line, in Pillow's own font.
 
@@ -232,7 +228,6 @@ def rectangle(size: tuple[int, int], seed: int = 0) -> Tensor:
     """The whole card but its outermost texels.
 
     Args:
-        size: (H, W) in texels.
         seed: not used, there is only one rectangle.
 
     Example:

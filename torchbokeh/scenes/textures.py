@@ -1,9 +1,9 @@
 """Textures: pictures of any size, made from a seed.
 
-Every texture takes the size, a seed, and settings that are drawn from the seed where they are None. It returns
-``(3, H, W)`` float32 linear radiance, non-negative, in [0, 1] but for :func:`lights`. It raises a TypeError for an
-argument of the wrong kind, and a ValueError for one out of its range. Lengths are relative to the longer side, so that
-a larger picture shows the same things larger; edges are anti-aliased.
+Every texture takes the size (H, W) in pixels, a seed, and settings that are drawn from the seed where they are None. It
+returns ``(3, H, W)`` float32 linear radiance, non-negative, in [0, 1] but for :func:`lights`. It raises a TypeError for
+an argument of the wrong kind, and a ValueError for one out of its range. Lengths are relative to the longer side, so
+that a larger picture shows the same things larger; edges are anti-aliased.
 """
 
 import math
@@ -33,8 +33,6 @@ def noise(
     """Clouds, marble, rust: octaves of smooth value noise through a ramp of colours.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         octaves: 1 to 10, each twice as fine; those finer than two pixels are left out.
         cells: features of the coarsest octave along the longer side, 0.5 to 64.
         roughness: weight of an octave over that of the one before, 0 to 1.
@@ -76,8 +74,6 @@ def voronoi(
     """Cells of random colours, as of pebbles, cracked mud or stained glass.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         cells: cells along the longer side, 1 to 200.
         border: width of the border over the size of a cell, 0 (none) to 0.5.
         shading: how much darker a cell is at its border, 0 to 1.
@@ -137,8 +133,6 @@ def brick(
     """A wall of bricks with mortar between them.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         rows: rows of bricks along the longer side, 1 to 200.
         mortar: width of the joints over the height of a row, 0 to 0.5.
         variation: how much bricks differ from one another, 0 to 1.
@@ -178,7 +172,6 @@ def checker(size: tuple[int, int], seed: int, *, cells: float | None = None, rot
     """A chessboard of two colours.
 
     Args:
-        size: (H, W) in pixels.
         seed: draws what is None, and the phase.
         cells: squares along the longer side, 1 to 200.
         rotation: radians, counter-clockwise as seen in the image.
@@ -212,8 +205,6 @@ def dead_leaves(
     """Discs that fall on one another, with the edge statistics of natural pictures.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         count: number of discs, 1 to 10000; the first fall on noise.
         smallest: least radius over the longer side, 0.002 to 0.2; the greatest is 0.3.
         exponent: the density of a radius falls with this power of it, 1.5 to 5; 3 makes the picture look the
@@ -255,8 +246,6 @@ def line_art(size: tuple[int, int], seed: int, *, strokes: int | None = None, wi
     """A drawing in ink: curves, circles and hatched patches.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         strokes: number of things drawn, 1 to 500.
         width: width of the pen over the longer side, 0.001 to 0.1.
 
