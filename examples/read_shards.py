@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import torchbokeh as tb
-from torchbokeh.datasets.shards import read_shards, write_shards
+from torchbokeh.datasets import read_shards, write_shards
 from torchbokeh.scenes import ProceduralDataset
 
 

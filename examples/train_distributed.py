@@ -16,7 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 import torchbokeh as tb
-from torchbokeh.datasets.shards import read_shards, write_shards
+from torchbokeh.datasets import read_shards, write_shards
 from torchbokeh.scenes import ProceduralDataset
 
 

@@ -1,8 +1,10 @@
 """Argument checks: each error names the argument, what was expected and what came."""
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -17,14 +19,24 @@ def check_pixels(name: str, height: int, width: int) -> None:
         raise ValueError(f"{name}: expected at most {MOST_PIXELS} pixels, got {width} x {height}")
 
 
-def check_whole(name: str, value: object, low: int, high: int) -> int:
+def is_whole(value: object) -> TypeGuard[int]:
+    """Whether ``value`` is a whole number; a bool is none."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether ``value`` is a real number; a bool is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def check_whole(name: str, value: object, low: int, high: int = sys.maxsize) -> int:
     """Check a whole number from ``low`` to ``high``, and return it.
 
     Raises:
         TypeError: another kind of value.
         ValueError: out of its range.
     """
-    if not isinstance(value, Integral) or isinstance(value, bool):
+    if not is_whole(value):
         raise TypeError(f"{name}: expected an int, got {value!r}")
     number = int(value)
     if number < low:
@@ -34,13 +46,31 @@ def check_whole(name: str, value: object, low: int, high: int) -> int:
     return number
 
 
+def check_count(name: str, value: object, low: int, high: int) -> int:
+    """As `check_whole`, for a range so narrow that the message names both of its ends."""
+    if not is_whole(value):
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+    if not low <= value <= high:
+        raise ValueError(f"{name}: expected {low} to {high}, got {value}")
+    return int(value)
+
+
 def check_number(name: str, value: object, low: float | None = None, high: float = math.inf) -> float:
     """As `check_whole`, for a number; NaN is out of every range. Without ``low``, only that it is one."""
-    if not isinstance(value, Real) or isinstance(value, bool):
+    if not is_number(value):
         raise TypeError(f"{name}: expected a number, got {value!r}")
     number = float(value)
     if low is not None and not low <= number <= high:
         raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {number:g}")
+    return number
+
+
+def check_finite(name: str, value: object, low: float, *, above: bool = False) -> float:
+    """As `check_number`, for a finite number of at least ``low``, or only above it."""
+    number = check_number(name, value)
+    if not low <= number < math.inf or (above and number == low):
+        bound = "above" if above else "of at least"
+        raise ValueError(f"{name}: expected a finite number {bound} {low:g}, got {number}")
     return number
 
 
@@ -57,21 +87,16 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise ValueError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r}")
 
 
-def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise a TypeError unless ``value`` is a ``kind``."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+def check_kind(name: str, value: object, kind: type, *, optional: bool = False) -> None:
+    """Raise a TypeError unless ``value`` is a ``kind``, or None where it is ``optional``."""
+    if not isinstance(value, kind) and not (optional and value is None):
+        article = "an" if kind.__name__[0] in "AEIOUaeiou" else "a"
+        wanted = f"{article} {kind.__name__}{' or None' if optional else ''}"
+        raise TypeError(f"{name}: expected {wanted}, got {type(value).__name__}")
 
 
 def check_size(size: Sequence[int], name: str = "size") -> tuple[int, int]:
-    """The height and the width in pixels, both at least 1.
-
-    Args:
-        size: (H, W).
-        name: of the argument, for the message.
-
-    Returns:
-        The two as ints.
+    """The height and the width of a ``size`` (H, W) in pixels, both at least 1.
 
     Raises:
         TypeError: not two integers.
@@ -82,7 +107,7 @@ def check_size(size: Sequence[int], name: str = "size") -> tuple[int, int]:
         (3, 5)
     """
     pair = tuple(size) if isinstance(size, Sequence) and not isinstance(size, str) else ()
-    if len(pair) != 2 or not all(isinstance(n, Integral) and not isinstance(n, bool) for n in pair):
+    if len(pair) != 2 or not all(is_whole(n) for n in pair):
         raise TypeError(f"{name}: expected two integers (H, W), got {size!r}")
     if min(pair) < 1:
         raise ValueError(f"{name}: expected (H, W) of at least 1, got {size!r}")

@@ -10,7 +10,7 @@ import re
 import torch
 from torch import Tensor, nn
 
-from torchbokeh.ops.checks import check_image, check_number
+from torchbokeh.ops.checks import check_count, check_image, check_number
 from torchbokeh.ops.spans import Profile
 
 CHORDS = 16
@@ -19,13 +19,12 @@ CHORDS = 16
 
 def _setting(module: nn.Module, name: str, value: float | Tensor, low: float, high: float) -> None:
     """Keep an ``nn.Parameter`` as it is and make anything else a buffer, after a check of its range."""
-    tensor = value if isinstance(value, Tensor) else torch.tensor(check_number(name, value, low, high))
+    tensor = value if isinstance(value, Tensor) else torch.tensor(check_number(name, value))
     if not tensor.is_floating_point():
         raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}")
     if tensor.dim() != 0:
         raise ValueError(f"{name}: expected one number, got shape {tuple(tensor.shape)}")
-    if not low <= tensor.item() <= high:
-        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {tensor.item():g}")
+    check_number(name, tensor.item(), low, high)
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
     else:
@@ -128,11 +127,7 @@ class Polygon(Aperture):
 
     def __init__(self, blades: int = 6, rotation: float | Tensor = 0.0, curvature: float | Tensor = 0.0) -> None:
         super().__init__()
-        if not isinstance(blades, int) or isinstance(blades, bool):
-            raise TypeError(f"blades: expected an int, got {type(blades).__name__}")
-        if not 3 <= blades <= 64:
-            raise ValueError(f"blades: expected 3 to 64, got {blades}")
-        self.blades = blades
+        self.blades = check_count("blades", blades, 3, 64)
         _setting(self, "rotation", rotation, -1e3, 1e3)
         _setting(self, "curvature", curvature, 0.0, 1.0)
 

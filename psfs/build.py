@@ -9,25 +9,24 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
+from torchbokeh.ops.checks import check_whole
 from torchbokeh.ops.system.files import replacing
 from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.model import PsfModel
 from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import Represented, Target, represent
-from torchbokeh.psfs.similarity import neighbourhood, score
+from torchbokeh.psfs.similarity import Score, neighbourhood, score
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-@dataclass(frozen=True)
-class Built:
+class Built(NamedTuple):
     """One sample and how good it is.
 
     Attributes:
@@ -56,11 +55,11 @@ def build_sample(model: PsfModel, number: int, target: Target) -> Built:
     psf = model.prefiltered(*model.grid.box(number))
     found = represent(psf, model.symmetry, turns=model.turns, target=target)
     rounded = Sparse(found.sparse.points, found.sparse.values.astype(np.float32).astype(np.float64))
-    ssim, ssim_frame, l1 = 1.0, 1.0, 0.0
+    reached = Score(1.0, 1.0, 0.0)
     if found.domain == "laplacian":
-        ssim, ssim_frame, l1 = score(psf, reconstruction(rounded, neighbourhood(psf)))
+        reached = score(psf, reconstruction(rounded, neighbourhood(psf)))
     support = int((psf > 0).any(0).sum())
-    return Built(Represented(found.domain, rounded), support, ssim, ssim_frame, l1, time.perf_counter() - start)
+    return Built(Represented(found.domain, rounded), support, *reached, time.perf_counter() - start)
 
 
 def build(
@@ -84,38 +83,35 @@ def build(
     Raises:
         ChildProcessError: a worker was killed.
         OSError: a file cannot be written.
+        TypeError: ``workers`` is no int.
         ValueError: ``workers`` is below 1.
     """
-    if workers < 1:
-        raise ValueError(f"workers: expected at least 1, got {workers}")
+    from tqdm import tqdm
+
+    check_whole("workers", workers, 1)
     target = Target(ssim=model.similarity) if target is None else target
     path = Path(path)
     parts = path.with_name(path.name + ".parts")
     parts.mkdir(parents=True, exist_ok=True)
     order = {"model": model.name, "settings": model.settings(), "target": target._asdict()}
-    _claim(parts, json.dumps(order, sort_keys=True))
+    _remove_other_parts(parts, json.dumps(order, sort_keys=True))
     count = len(model.grid)
     missing = [k for k in range(count) if not _part(parts, k).is_file()]
     work = _finished(model, missing, target, workers, parts)
-    if progress:
-        from tqdm import tqdm
-
-        work = tqdm(work, total=count, initial=count - len(missing), desc=model.name, unit="PSF")
-    for _ in work:
+    done = count - len(missing)
+    for _ in tqdm(work, total=count, initial=done, desc=model.name, unit="PSF", disable=not progress):
         pass
     samples = [_read(_part(parts, k)) for k in range(count)]
-    measured = [{k: v for k, v in asdict(s).items() if k != "represented"} for s in samples]
-    columns: dict[str, Any] = {
-        key: [round(row[key], 5) for row in measured] for key in ("support", "ssim", "ssim_frame", "l1")
-    }
+    measured = ("support", "ssim", "ssim_frame", "l1")
+    columns = {name: [round(getattr(sample, name), 5) for sample in samples] for name in measured}
     bank = PsfBank(model, [s.represented for s in samples], {"target": target._asdict(), **columns})
     bank.save(path)
     shutil.rmtree(parts)
     return bank
 
 
-def _claim(parts: Path, order: str) -> None:
-    """Forget parts that were built to another order."""
+def _remove_other_parts(parts: Path, order: str) -> None:
+    """Remove parts that were built to another order, and note the order of those to come."""
     note = parts / "order.json"
     if note.is_file() and note.read_text() == order:
         return
@@ -167,10 +163,9 @@ def _single_threads() -> Iterator[None]:
 
 def _job(model: PsfModel, number: int, target: Target, path: Path) -> int:
     found = build_sample(model, number, target)
-    points, values = found.represented.sparse
-    scores = [found.support, found.ssim, found.ssim_frame, found.l1, found.seconds]
+    (domain, (points, values)), *scores = found
     with replacing(path) as temporary:
-        np.savez(temporary, domain=found.represented.domain, points=points, values=values, scores=np.array(scores))
+        np.savez(temporary, domain=domain, points=points, values=values, scores=np.array(scores))
     return number
 
 

@@ -10,19 +10,13 @@ boxes have edges of ``l + 1``, or what is left of them at the upper border. In o
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
-from itertools import product
+from itertools import accumulate, count, product, takewhile
 
 import torch
 from torch import Tensor
 
 LARGEST = 1 << 24
 """Units of a grid, at most: there is a table of them."""
-
-
-def triangular_root(x: Tensor) -> Tensor:
-    """The largest integer l with ``l (l+1) / 2 <= x``, for x >= 0, exact for whole numbers up to 2**40."""
-    return ((8 * x.double().floor() + 1).sqrt().sub(1) / 2).floor().long()
 
 
 class NestedGrid:
@@ -60,15 +54,16 @@ class NestedGrid:
         self.bounds = tuple(float(b) for b in bounds)
         self.betas = tuple(float(b) for b in betas)
         self.cells = tuple(int(n) for n in cells)
-        least = min(self.cells)
-        starts = [level * (level + 1) // 2 for level in range(int(triangular_root(torch.tensor(least - 1))) + 1)]
-        self._counts = [[-(-(n - start) // (level + 1)) for n in self.cells] for level, start in enumerate(starts)]
-        sizes = [math.prod(m) - math.prod(k - 1 for k in m) for m in self._counts]
-        self._first = [sum(sizes[:level]) for level in range(len(sizes) + 1)]
+        boxes = self.boxes()
+        with torch.inference_mode(False):  # what is kept may be asked for gradients later
+            self._corners = torch.tensor(boxes, dtype=torch.float64)
+            self._table = torch.empty(self.cells, dtype=torch.int64)
+            for number, corners in enumerate(boxes):
+                self._table[tuple(map(slice, *corners))] = number
 
     def __len__(self) -> int:
         """The number of boxes."""
-        return self._first[-1]
+        return len(self._corners)
 
     def remap(self, coordinates: Tensor) -> Tensor:
         """Coordinates ``(..., n)`` to grid units ``[0, N]``; what lies outside the bounds goes to their border."""
@@ -94,39 +89,7 @@ class NestedGrid:
         """The box that holds a place ``(..., n)`` in grid units: corners of boxes are whole, so that a table tells."""
         top = torch.tensor(self.cells, device=place.device) - 1
         inside = torch.minimum(place.clamp_min(0).long(), top)
-        flat = inside[..., 0]
-        for axis, count in enumerate(self.cells[1:], 1):
-            flat = flat * count + inside[..., axis]
-        return self._table.to(place.device)[flat]
-
-    @cached_property
-    def _table(self) -> Tensor:
-        """The box of every unit of the grid, flat: `_ranked` of their lower corners."""
-        units = torch.cartesian_prod(*(torch.arange(n) for n in self.cells)).reshape(-1, len(self.cells))
-        return self._ranked(units)
-
-    def _ranked(self, units: Tensor) -> Tensor:
-        """The number of the box that holds whole places ``(M, n)``, in constant time (LKS section 5.2)."""
-        level = triangular_root(units.amin(1))
-        inner = (units - (level * (level + 1) // 2)[:, None]) // (level + 1)[:, None]
-        # Boxes of a level have an index of 0 along some axis: first those that have it along axis 0, all others being
-        # free; then those that have not, but along axis 1; and so on.
-        counts, found = torch.tensor(self._counts)[level], torch.tensor(self._first)[level]
-        before, settled = torch.zeros_like(level), torch.zeros_like(level, dtype=torch.bool)
-        axes = range(len(self.cells))
-        for axis in axes:
-            rank, group = torch.zeros_like(level), torch.ones_like(level)
-            for other in axes:
-                if other == axis:
-                    continue
-                free = counts[:, other] - int(other < axis)
-                rank = rank * free + inner[:, other] - int(other < axis)
-                group = group * free
-            here = ~settled & (inner[:, axis] == 0)
-            found = found + torch.where(here, before + rank, 0)
-            settled = settled | here
-            before = before + group
-        return found
+        return self._table.to(place.device)[inside.unbind(-1)]
 
     def neighbours(self, coordinates: Tensor) -> list[tuple[Tensor, Tensor]]:
         """The ``2**n`` boxes that linear interpolation takes, with their shares.
@@ -141,15 +104,16 @@ class NestedGrid:
         Returns:
             Pairs of numbers ``(...)`` and shares ``(...)``, float64.
         """
-        place = torch.minimum(self.remap(coordinates).double(), self._inside(coordinates.device))
+        # The largest place that lies within the grid.
+        edge = torch.tensor(self.cells, dtype=torch.float64, device=coordinates.device) * (1 - 2.0**-52)
+        place = torch.minimum(self.remap(coordinates).double(), edge)
         own = self._at(place.detach())
-        corners = torch.tensor(self.boxes(), dtype=torch.float64, device=coordinates.device)
+        corners = self._corners.to(coordinates.device)
         low, high = corners[own].unbind(-2)
         middle, half = (low + high) / 2, (high - low) / 2
         inside = place.detach()
         forward = torch.where(inside >= middle, 1.0, -1.0)
         beyond = torch.where(forward > 0, high, low - 1e-9)
-        edge = self._inside(coordinates.device)
         there = (beyond >= 0) & (beyond <= edge)
         shares = []
         for axis in range(len(self.cells)):
@@ -159,26 +123,25 @@ class NestedGrid:
             gap = half[..., axis] + (other[..., 1] - other[..., 0]) / 2
             far = (place[..., axis] - middle[..., axis]).abs() / gap
             shares.append(torch.where(there[..., axis], far, 0.0))
+        across = torch.where(there, beyond, inside)
         found = []
         for picked in product((False, True), repeat=len(self.cells)):
-            step, weight = inside.clone(), torch.ones_like(place[..., 0])
-            for axis, taken in enumerate(picked):
-                weight = weight * (shares[axis] if taken else 1 - shares[axis])
-                if taken:
-                    step[..., axis] = torch.where(there[..., axis], beyond[..., axis], inside[..., axis])
+            weight = torch.ones_like(place[..., 0])
+            for taken, share in zip(picked, shares, strict=True):
+                weight = weight * (share if taken else 1 - share)
+            step = torch.where(torch.tensor(picked, device=place.device), across, inside)
             found.append((self._at(step), weight))
         return found
-
-    def _inside(self, device: torch.device) -> Tensor:
-        """The largest place that lies within the grid."""
-        return torch.tensor(self.cells, dtype=torch.float64, device=device) * (1 - 2.0**-52)
 
     def boxes(self) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
         """Lower and upper corner of every box in grid units, in order: the list that LKS stores."""
         found = []
         axes = range(len(self.cells))
-        for level, counts in enumerate(self._counts):
-            start, edge = level * (level + 1) // 2, level + 1
+        for level, start in enumerate(takewhile(lambda start: start < min(self.cells), accumulate(count()))):
+            edge = level + 1
+            counts = [-(-(n - start) // edge) for n in self.cells]
+            # Boxes of a level have an index of 0 along some axis: first those that have it along axis 0, all others
+            # being free; then those that have not, but along axis 1; and so on.
             for axis in axes:
                 ranges = [range(other < axis, counts[other]) if other != axis else range(1) for other in axes]
                 for place in product(*ranges):
@@ -191,11 +154,9 @@ class NestedGrid:
         """Lower and upper corner of a box in coordinates: the backward mapping of LKS."""
         if not 0 <= number < len(self):
             raise ValueError(f"number: expected 0 to {len(self) - 1}, got {number}")
-        low, high = self.boxes()[number]
-        corners = self.unmap(torch.tensor([low, high], dtype=torch.float64)).tolist()
-        return tuple(corners[0]), tuple(corners[1])
+        low, high = self.unmap(self._corners[number]).tolist()
+        return tuple(low), tuple(high)
 
     def centres(self) -> Tensor:
         """The middle ``(K, n)`` of every box, taken in grid units, as coordinates."""
-        corners = torch.tensor(self.boxes(), dtype=torch.float64)
-        return self.unmap(corners.mean(1))
+        return self.unmap(self._corners.mean(1))

@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchbokeh.ops.checks import check_number
+from torchbokeh.ops.checks import check_finite, check_number
 from torchbokeh.ops.sellmeier import refractive_index
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, field_of, scaled, turned
-from torchbokeh.psfs.tracing import cropped, splat_rays, spread
-
-Array = NDArray[np.float64]
+from torchbokeh.psfs.tracing import cropped, sobol_points, splat_rays
 
 WAVELENGTHS = (0.650, 0.510, 0.475)
 """Of red, green and blue in micrometres."""
@@ -192,9 +191,7 @@ class PhysicalLens(PsfModel):
         sensor = {"sensor_width": sensor_width, "width": width}
         lowest = {"f_number": 1.0, "focus_distance": 2 * check_number("focal_length", focal_length)}
         for name, value in (lens | sensor).items():
-            check_number(name, value)
-            if not lowest.get(name, 0.0) < value < math.inf:
-                raise ValueError(f"{name}: expected a finite number above {lowest.get(name, 0.0):g}, got {value}")
+            check_finite(name, value, lowest.get(name, 0.0), above=True)
         if sensor_width > focal_length:
             raise ValueError(f"sensor_width: expected at most the focal length, {focal_length:g}, got {sensor_width:g}")
         self._settings = {"side": side, **lens, **sensor}
@@ -240,7 +237,7 @@ class PhysicalLens(PsfModel):
 
     def _traced(self, places: Sequence[Sequence[float]]) -> Array:
         """The mean of PSFs. Each gets a part of Sobol's sequence, which fills the stop by itself."""
-        parts = np.split(spread(POWER, SEED), len(places), axis=1)
+        parts = np.split(sobol_points(POWER, SEED), len(places), axis=1)
         picture = np.zeros((3, FRAME, FRAME))
         for part, (coc, eccentricity) in zip(parts, places, strict=True):
             self._light(picture, part, coc, eccentricity)

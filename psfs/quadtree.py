@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchbokeh.psfs.refit import Array
+from torchbokeh.ops.checks import check_whole
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.sparsify import NOISE, check_picture
 
 
@@ -62,8 +63,7 @@ def quadtree(psf: Array, leaves: int) -> Array:
 def tree(psf: Array, leaves: int) -> list[Square]:
     """The squares of a `quadtree` that are not 0."""
     check_picture("psf", psf, 3)
-    if leaves < 1:
-        raise ValueError(f"leaves: expected at least 1, got {leaves}")
+    check_whole("leaves", leaves, 1)
     height, width = psf.shape[1:]
     half = 1 << max(height // 2, width // 2).bit_length()
     root = Square(height // 2 - half, width // 2 - half, 2 * half)

@@ -16,10 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchbokeh.ops.integrate import lattice_green, poisson_fft
+from torchbokeh.psfs.arrays import Array, Points
 from torchbokeh.psfs.model import Symmetry
-
-Array = NDArray[np.float64]
-Points = NDArray[np.int64]
 
 OUTSIDE = 3.0
 """Weight of a pixel that the PSF does not reach: what leaks there is seen over dark surroundings."""

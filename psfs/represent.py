@@ -3,13 +3,12 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchbokeh.psfs.arrays import Array, Points
 from torchbokeh.psfs.model import Symmetry
-from torchbokeh.psfs.refit import Fit, Points, Sparse, fewest, fundamental, reconstruction
+from torchbokeh.psfs.refit import Fit, Sparse, fewest, fundamental, reconstruction
 from torchbokeh.psfs.similarity import neighbourhood, score
 
-Array = NDArray[np.float64]
 Domain = Literal["direct", "scanline", "laplacian"]
 DOMAINS: tuple[Domain, ...] = ("direct", "scanline", "laplacian")
 

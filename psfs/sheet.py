@@ -2,15 +2,14 @@
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.bank import PsfBank
+from torchbokeh.psfs.refit import drawn
 from torchbokeh.psfs.represent import laplacian
 from torchbokeh.psfs.similarity import centred, neighbourhood
 from torchbokeh.psfs.table import integrated
-
-Array = NDArray[np.float64]
 
 GAP = 4
 """Pixels between the pictures."""
@@ -48,15 +47,13 @@ def _pictures(bank: PsfBank, number: int) -> list[Array]:
     represented = bank.sample(number)
     size = neighbourhood(psf)
     dense, near = centred(psf, size), integrated(represented, size)
-    points = np.zeros((psf.shape[0], *size))
-    x, y = represented.sparse.points.T
-    inside = (np.abs(x) <= size[1] // 2) & (np.abs(y) <= size[0] // 2)
-    points[:, y[inside] + size[0] // 2, x[inside] + size[1] // 2] = represented.sparse.values[inside].T
+    reach = int(np.abs(represented.sparse.points).max(initial=0))
+    points = drawn(represented.sparse, (reach, reach))
     top = _white_point(dense)
     return [
         _white(dense / top),
         _signed(centred(laplacian(psf), size)),
-        _signed(points),
+        _signed(centred(points, size)),
         _white(near / top),
         _signed((near - dense) / top * ERROR, 1.0),
     ]
@@ -87,6 +84,5 @@ def _framed(picture: Array, tile: int) -> Array:
     if side <= tile:
         out = square[:, pixel][:, :, pixel]
     else:
-        starts = pixel
-        out = np.maximum.reduceat(np.maximum.reduceat(square, starts, 1), starts, 2)
+        out = np.maximum.reduceat(np.maximum.reduceat(square, pixel, 1), pixel, 2)
     return np.pad(out, ((0, 0), (0, GAP), (0, GAP)), constant_values=0.2)

@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME
-
-Array = NDArray[np.float64]
 
 NEAR = 8
 """Pixels around a PSF that belong to its neighbourhood."""

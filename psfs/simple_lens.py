@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.combined import capsule, of_radius
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 
@@ -55,6 +53,6 @@ class SimpleLens(RadiusModel):
         """The largest radius."""
         return {"radius": self.axes[0].bound + MIN_RADIUS}
 
-    def dense(self, coordinates: Sequence[float]) -> NDArray[np.float64]:
+    def dense(self, coordinates: Sequence[float]) -> Array:
         """The light of a disc on every pixel."""
         return capsule(coordinates[0] + MIN_RADIUS, 0.0)

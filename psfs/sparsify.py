@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchbokeh.psfs.refit import Array, Points, Sparse, reconstruction
+from torchbokeh.ops.checks import check_finite, check_whole
+from torchbokeh.psfs.arrays import Array, Points
+from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import laplacian as laplacian_of
 from torchbokeh.psfs.represent import nonzero
 from torchbokeh.psfs.similarity import centred, neighbourhood, score
@@ -56,8 +58,7 @@ def dart_throwing(importance: Array, scale: float, seed: int, failures: int = 10
         (9, 1)
     """
     check_picture("importance", importance, 2)
-    if not 0 <= scale < math.inf:
-        raise ValueError(f"scale: expected a finite number of at least 0, got {scale:g}")
+    check_finite("scale", scale, 0)
     height, width = importance.shape
     weight = importance.ravel().cumsum()
     radius = np.full(importance.shape, math.inf)
@@ -103,8 +104,7 @@ def points_for(importance: Array, count: int, seed: int) -> Points:
         20
     """
     check_picture("importance", importance, 2)
-    if count < 1:
-        raise ValueError(f"count: expected at least 1, got {count}")
+    check_whole("count", count, 1)
     # At the upper end, the radius of every pixel is the largest: there is room for one point.
     low, high = 0.0, sum(importance.shape) * math.sqrt(importance.max() / importance.sum())
     best = dart_throwing(importance, high, seed)

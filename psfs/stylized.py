@@ -6,15 +6,16 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchbokeh.ops.checks import check_number
 from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import Axis
 from torchbokeh.psfs.simple_lens import RadiusModel
 from torchbokeh.psfs.tracing import cropped
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -69,9 +70,10 @@ def decoded(text: str) -> Mask:
 
 def light_of(mask: Mask) -> Array:
     """Linear light ``(3, H, W)`` of a mask: its colours times alpha, with a luminance that sums to 1."""
-    values = mask / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    light = np.moveaxis(linear[..., :3] * values[..., 3:], 2, 0)
+    from kornia.color import rgb_to_linear_rgb
+
+    values = torch.from_numpy(np.moveaxis(mask, 2, 0) / 255)
+    light = (rgb_to_linear_rgb(values[:3]) * values[3:]).numpy()
     total = LUMINANCE @ light.sum((1, 2))
     if total == 0:
         raise ValueError("mask: expected a pixel that is neither black nor transparent, got none")

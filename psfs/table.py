@@ -5,14 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.refit import Sparse, drawn, reconstruction
 from torchbokeh.psfs.represent import Represented
 from torchbokeh.psfs.similarity import centred, neighbourhood, score
-
-Array = NDArray[np.float64]
 
 LKS = {
     "simple-lens": (100, "2.0", 1.1, 31.3),

@@ -3,13 +3,12 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from torchbokeh.psfs.arrays import Array
 
 
 @lru_cache(maxsize=1)
-def spread(power: int, seed: int) -> Array:
+def sobol_points(power: int, seed: int) -> Array:
     """``2**power`` points ``(2, n)`` that fill the unit square evenly: Sobol's, scrambled by a seed."""
     from scipy.stats import qmc
 
@@ -52,10 +51,7 @@ def splat_rays(picture: Array, x: Array, y: Array, light: Array) -> None:
 
 def cropped(picture: Array) -> Array:
     """A centred picture ``(C, h, w)`` without the borders that are zero in all channels, still centred."""
-    lit = (picture != 0).any(0)
-    reach = []
-    for axis in (0, 1):
-        middle = lit.shape[axis] // 2
-        reach.append((middle, int(np.abs(np.nonzero(lit.any(1 - axis))[0] - middle).max(initial=0))))
-    (y, up), (x, out) = reach
+    y, x = (n // 2 for n in picture.shape[1:])
+    rows, columns = np.nonzero((picture != 0).any(0))
+    up, out = (int(np.abs(away).max(initial=0)) for away in (rows - y, columns - x))
     return picture[:, y - up : y + up + 1, x - out : x + out + 1]

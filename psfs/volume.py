@@ -4,13 +4,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchbokeh.ops.checks import check_number
+from torchbokeh.ops.checks import check_finite, check_number
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel
 from torchbokeh.psfs.tracing import cropped
-
-Array = NDArray[np.float64]
 
 ANISOTROPY = 0.8
 """Mean cosine of the angle by which light is scattered, g."""
@@ -149,13 +147,10 @@ class Volume(PsfModel):
     tints = True
 
     def __init__(self, density: float = 0.9, distance: float = 5.0, focal: float = 1024.0) -> None:
-        for name, value in (("density", density), ("distance", distance), ("focal", focal)):
-            check_number(name, value)
-        if not 0 < density < math.inf:
-            raise ValueError(f"density: expected a finite number above 0, got {density}")
-        if not 0 < distance <= 8:
+        check_finite("density", density, 0, above=True)
+        if not 0 < check_number("distance", distance) <= 8:
             raise ValueError(f"distance: expected a number of mean free paths above 0 and at most 8, got {distance}")
-        if not REACH <= focal < math.inf:
+        if not REACH <= check_number("focal", focal) < math.inf:
             raise ValueError(f"focal: expected a finite number of px from {REACH} on, got {focal}")
         self.density, self.focal = density, focal
         self.axes = (Axis("distance", "mean free paths", distance, 1.0, 100 * 101 // 2),)

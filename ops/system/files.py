@@ -73,3 +73,11 @@ def check_place(path: Path) -> None:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise ValueError(f"{path}: cannot write there ({error.strerror}); choose another folder") from None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder where it is missing, and those that it lies in; raise a ValueError where that cannot be done."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be made a folder ({error.strerror}); choose another") from None

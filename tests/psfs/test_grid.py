@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchbokeh.psfs.grid
-from torchbokeh.psfs.grid import NestedGrid, triangular_root
+from torchbokeh.psfs.grid import NestedGrid
 
 F64 = torch.float64
 
@@ -22,14 +22,6 @@ def grid(cells: tuple[int, ...]) -> NestedGrid:
 
 def test_the_example_of_the_paper_has_28_boxes() -> None:
     assert len(NestedGrid((1.0, 1.0), (1.0, 1.0), (9, 9))) == 28
-
-
-def test_the_triangular_root_is_exact() -> None:
-    levels = torch.arange(0, 100_000)
-    starts = levels * (levels + 1) // 2
-    assert torch.equal(triangular_root(starts), levels)
-    assert torch.equal(triangular_root(starts[1:] - 1), levels[:-1])
-    assert torch.equal(triangular_root(starts.double() + 0.999), levels)
 
 
 @given(st.lists(st.integers(1, 24), min_size=1, max_size=3).map(tuple))

@@ -9,15 +9,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import torchbokeh.psfs.physical_lens
 from torchbokeh.ops.sellmeier import refractive_index
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import Labels, PsfModel, mean_picture
 from torchbokeh.psfs.physical_lens import PhysicalLens, singlet, trace
 from torchbokeh.psfs.tracing import splat_rays
-
-Array = NDArray[np.float64]
 
 GREEN = 510.0
 F64 = torch.float64

@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchbokeh.psfs.quadtree
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.combined import capsule
 from torchbokeh.psfs.quadtree import quadtree, tree
-from torchbokeh.psfs.refit import Array, reconstruction
+from torchbokeh.psfs.refit import reconstruction
 from torchbokeh.psfs.similarity import centred, neighbourhood, score
 from torchbokeh.psfs.sparsify import sparsify
 

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchbokeh.psfs.sparsify
+from torchbokeh.psfs.arrays import Array, Points
 from torchbokeh.psfs.combined import capsule
-from torchbokeh.psfs.refit import Array, Points, Sparse, reconstruction
+from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import laplacian, nonzero
 from torchbokeh.psfs.similarity import neighbourhood, score
 from torchbokeh.psfs.sparsify import (

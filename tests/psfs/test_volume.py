@@ -9,13 +9,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import torchbokeh.psfs.volume
+from torchbokeh.psfs.arrays import Array
 from torchbokeh.psfs.model import Labels
 from torchbokeh.psfs.volume import ANISOTROPY, REACH, Volume, deflections, disc, edges, glow, scattered
-
-Array = NDArray[np.float64]
 
 PHOTONS = 1 << 14
 FOCAL = 1024.0

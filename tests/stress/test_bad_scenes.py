@@ -192,7 +192,7 @@ WITHOUT_ARGUMENTS_TO_CHECK = {
     "RECIPES": "a dict of functions that are in the table one by one",
     "build": "takes minutes; psfs/test_bank.py calls it",
     "read_shards": "reads files: test_hostile_claims.py",
-    "write_shards": "writes files: scenes/test_shards.py",
+    "write_shards": "writes files: datasets/test_writing.py",
 }
 
 

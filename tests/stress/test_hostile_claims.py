@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchbokeh.datasets.shards import shard_indices
+from torchbokeh.datasets.layout import shard_indices
 from torchbokeh.io.flow import MAGIC, read_flow
 from torchbokeh.io.pictures import read_image, read_map
 from torchbokeh.psfs import PsfBank, SimpleLens

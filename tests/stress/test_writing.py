@@ -26,7 +26,7 @@ import torchbokeh as tb
 from torchbokeh.io.pictures import write_image
 from torchbokeh.report.sheets import write_sheet
 from torchbokeh.report.write import write_together
-from torchbokeh.datasets.shards import write_shards
+from torchbokeh.datasets import write_shards
 
 image, bank = torch.rand(1, 3, 40, 50), tb.PsfBank.load("combined")
 dataset = tb.scenes.ProceduralDataset(resolution=(16, 24), length=2, views=4)

@@ -9,8 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 import torchbokeh
-from torchbokeh.io.pictures import check_writable, encode_srgb, replacing, sample_map, write_image
+from torchbokeh.io.pictures import check_writable, encode_srgb, sample_map, write_image
 from torchbokeh.lens import ThinLens
+from torchbokeh.ops.system.files import make_folder, replacing
 
 # Calibration of the Middlebury 2014 "Motorcycle" scene at the size that scikit-image carries.
 _WIDTH, _FOCAL_PX, _BASELINE, _OFFSET_PX = 741, 994.978, 0.193001, 31.086
@@ -98,10 +99,7 @@ def run_demo(out: str | Path, scale: float = 1.0, show_progress: bool = True) ->
 
     out = Path(out)
     image, depth = motorcycle(scale)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"{out}: cannot be made a folder ({error.strerror}); choose another") from None
+    make_folder(out)
     check_writable(out / "sheet.png")
     focal = _FOCAL_LENGTH * 1000
     camera = f"{focal:.1f} mm at f/{_F_NUMBER}, which no real lens reaches"

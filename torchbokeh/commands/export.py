@@ -5,7 +5,8 @@ from pathlib import Path
 
 import torch
 
-from torchbokeh.commands.scene import add_scene, check_flags, count, read_scene, refuse_overwriting
+from torchbokeh.commands.arguments import count
+from torchbokeh.commands.picture_flags import add_picture_flags, read_picture, refuse_overwriting, refuse_unused_flags
 from torchbokeh.learn.export import export_onnx
 from torchbokeh.learn.integration import PyramidIntegrator
 from torchbokeh.ops.system.files import check_place
@@ -17,7 +18,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
     kinds = parser.add_subparsers(metavar="KIND", required=True)
     about = "the whole blur, planned for this scene: image, depth, focus and f-number stay inputs"
     blur = kinds.add_parser("blur", help=about, allow_abbrev=False)
-    add_scene(blur)
+    add_picture_flags(blur)
     blur.set_defaults(run=run_blur, command="export blur")
     about = "the network that undoes the Laplacian of a picture"
     pyramid = kinds.add_parser("pyramid", help=about, description=about.capitalize() + ".", allow_abbrev=False)
@@ -30,22 +31,22 @@ def add_export(parser: argparse.ArgumentParser) -> None:
 
 def run_blur(args: argparse.Namespace) -> None:
     """Export the blur of a scene."""
-    check_flags(args)
+    refuse_unused_flags(args)
     _check_output(args.output)
     refuse_overwriting(args)
-    image, depth, blur = read_scene(args)
+    image, depth, blur = read_picture(args)
     with torch.no_grad():
         plan = blur.plan(image, depth)
     print(plan)
     export_onnx(blur, args.output, image, depth, plan=plan)
-    _say(args.output)
+    _print_size(args.output)
 
 
 def run_pyramid(args: argparse.Namespace) -> None:
     """Export the integration network."""
     _check_output(args.output)
     export_onnx(PyramidIntegrator(levels=args.levels), args.output, torch.zeros(1, args.channels, 64, 64))
-    _say(args.output)
+    _print_size(args.output)
 
 
 def _check_output(path: Path) -> None:
@@ -54,5 +55,5 @@ def _check_output(path: Path) -> None:
     check_place(path)
 
 
-def _say(path: Path) -> None:
+def _print_size(path: Path) -> None:
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from torchbokeh.commands.arguments import share, whole
+
 SHOWN = 8
 """Samples on a contact sheet."""
 
@@ -26,14 +28,14 @@ def add_psfs(parser: argparse.ArgumentParser) -> None:
     """
     from torchbokeh.psfs.models import MODELS
 
-    names = sorted(MODELS)
+    names, many = sorted(MODELS), whole(1, 100_000)
     commands = parser.add_subparsers(metavar="ACTION", required=True)
     build = commands.add_parser("build", help="compute the bank of a model", allow_abbrev=False)
     build.description = "Run it again to go on after an interruption."
     build.add_argument("model", choices=names, metavar="MODEL", help=", ".join(names))
     build.add_argument("--out", type=Path, metavar="FILE", help="default: MODEL.safetensors")
-    build.add_argument("--workers", type=_whole, default=1, metavar="W", help="processes (default 1)")
-    build.add_argument("--ssim", type=_share, metavar="S", help="least similarity of a sample (default: the model's)")
+    build.add_argument("--workers", type=many, default=1, metavar="W", help="processes (default 1)")
+    build.add_argument("--ssim", type=share, metavar="S", help="least similarity of a sample (default: the model's)")
     build.set_defaults(run=_build)
     show = commands.add_parser("show", help="draw a contact sheet", allow_abbrev=False)
     show.add_argument("bank", metavar="BANK", help=f"a file, or one of {', '.join(names)}")
@@ -41,7 +43,7 @@ def add_psfs(parser: argparse.ArgumentParser) -> None:
     show.set_defaults(run=_show)
     table = commands.add_parser("table", help="samples, size, sparsity and similarity of banks", allow_abbrev=False)
     table.add_argument("banks", nargs="*", metavar="BANK", help="files or models (default: all that are installed)")
-    table.add_argument("--held-out", type=_whole, default=100, metavar="N", help="coordinates to test (default 100)")
+    table.add_argument("--held-out", type=many, default=100, metavar="N", help="coordinates to test (default 100)")
     table.set_defaults(run=_table)
     analyse = commands.add_parser("analyse", help="how well sparse PSFs do, in tables and plots", allow_abbrev=False)
     analyse.description = "Repeats the analysis of LKS, section 7.3. Takes about four minutes."
@@ -115,19 +117,3 @@ def _analyse(args: argparse.Namespace) -> None:
 
     for path in write_analysis(analyse(quick() if args.quick else Settings(), say), args.out):
         print(path)
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 100000, got {text!r}")
-    return int(text)
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 1:
-        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, got {text!r}")
-    return value

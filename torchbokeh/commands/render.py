@@ -7,14 +7,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchbokeh.commands.scene import add_scene, check_flags, count, finite, read_scene, refuse_overwriting, stops
+from torchbokeh.commands.arguments import count, finite, stops
+from torchbokeh.commands.picture_flags import (
+    add_picture_flags,
+    check_same_size,
+    read_picture,
+    refuse_overwriting,
+    refuse_unused_flags,
+)
 from torchbokeh.io.flow import read_flow
 from torchbokeh.io.pictures import check_writable, write_image
 
 
 def add_render(parser: argparse.ArgumentParser) -> None:
     """Add the command's flags to its parser, and what it does."""
-    add_scene(parser)
+    add_picture_flags(parser)
     add = parser.add_argument
     add("-o", "--output", type=Path, metavar="OUT", required=True, help="PNG, TIFF (16 bits) or EXR")
     add("--dispersion", type=finite, metavar="STRENGTH", help="colours focused apart: 1 is a single lens (default 0)")
@@ -30,14 +37,14 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Blur the picture and write it."""
-    check_flags(args)
+    refuse_unused_flags(args)
     check_writable(args.output)
     refuse_overwriting(args, args.motion)
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: PyTorch finds no CUDA device; use --device cpu")
     if args.threads:
         torch.set_num_threads(args.threads)
-    image, depth, blur = read_scene(args)
+    image, depth, blur = read_picture(args)
     motion = _read_motion(args, image)
     image, depth, blur = image.to(args.device), depth.to(args.device), blur.to(args.device)
     with torch.no_grad():
@@ -54,7 +61,5 @@ def _read_motion(args: argparse.Namespace, image: Tensor) -> Tensor | None:
     if args.motion is None:
         return None
     motion = read_flow(args.motion)
-    if motion.shape[2:] != image.shape[2:]:
-        (h, w), (ih, iw) = motion.shape[2:], image.shape[2:]
-        raise ValueError(f"{args.motion}: is {w} x {h}, but {args.image} is {iw} x {ih}; they must be of one size")
+    check_same_size(args.motion, motion, args.image, image)
     return motion.to(args.device)

@@ -1,18 +1,16 @@
 """Training data without end: pictures, depth, motion and layers with the exact picture a camera would take."""
 
 import operator
-import sys
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch.nn.functional import pad
 from torch.utils.data import Dataset
 
-from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.checks import check_size, check_whole, is_number
 from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.scenes._random import check_size, rng
+from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.recipes import RECIPES
 
 MOST_LAYERS = 1024
@@ -69,7 +67,7 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
         rng(seed)
         self.seed = int(seed)
         self.resolution = check_size(resolution, "resolution")
-        self.length = check_whole("length", length, 0, sys.maxsize)
+        self.length = check_whole("length", length, 0)
         names = tuple(RECIPES) if recipes is None else recipes
         if not isinstance(names, Sequence):
             raise TypeError(f"recipes: expected names or None, got {recipes!r}")
@@ -81,18 +79,14 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             raise ValueError("recipes: expected at least one, got none")
         width = self.resolution[1]
         pair = (0.01 * width, 0.08 * width) if blur is None else blur
-        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(isinstance(r, Real) for r in pair):
+        if not isinstance(pair, Sequence) or len(pair) != 2 or not all(is_number(r) for r in pair):
             raise TypeError(f"blur: expected (smallest, largest) radius in px, got {blur!r}")
         self.blur = float(pair[0]), float(pair[1])
         if not 0 <= self.blur[0] <= self.blur[1] < float("inf"):
             raise ValueError(f"blur: expected (smallest, largest) radius in px, 0 or more, got {blur}")
         self.layers = check_whole("layers", layers, 1, MOST_LAYERS)
         buffer = AccumulationBuffer(views=views, level_of_detail=level_of_detail, reuse=reuse)
-        self.target: dict[str, Any] = {
-            "views": buffer.views,
-            "level_of_detail": buffer.level_of_detail,
-            "reuse": buffer.reuse,
-        }
+        self.target = {name: getattr(buffer, name) for name in ("views", "level_of_detail", "reuse")}
 
     def settings(self) -> dict[str, Any]:
         """All that the samples depend on, for a file beside them."""
@@ -128,15 +122,10 @@ class ProceduralDataset(Dataset[dict[str, Any]]):
             buffer = AccumulationBuffer(**self.target, seed=int(draw.integers(1 << 31)))
             target = buffer(scene, camera)[0, :3]
         for key, empty in (("layers", 0.0), ("layer_depth", torch.inf), ("layer_motion", 0.0)):
-            seen[key] = _filled(seen[key], self.layers, empty)
+            missing = self.layers - len(seen[key])  # all samples share a number of layers
+            seen[key] = pad(seen[key], (0, 0, 0, 0, 0, 0, 0, missing), value=empty)
         for key in ("alpha", "shutter_depth", "layer_shutter_depth"):
             del seen[key]
         lens = {key: value.clone() for key, value in camera.lens.values().items()}
         coc = camera.lens.coc(seen["depth"], self.resolution[1])
         return {**seen, "coc": coc, "target": target, "lens": lens, "recipe": name, "index": index}
-
-
-def _filled(layers: Tensor, count: int, empty: float) -> Tensor:
-    """Layers filled up to a number that all samples share."""
-    missing = layers.new_full((count - len(layers), *layers.shape[1:]), empty)
-    return torch.cat([layers, missing])

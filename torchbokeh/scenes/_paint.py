@@ -7,14 +7,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchbokeh.scenes._random import check_size
+from torchbokeh.ops.checks import check_size
 
 
-def lattice(size: tuple[int, int], pixels: float, angle: float, margin: int) -> tuple[Tensor, int]:
+def lattice(size: tuple[int, int], pixels: float, angle: float) -> tuple[Tensor, int]:
     """Coordinates ``(2, H, W)`` in cells of some pixels, turned about the middle, and a bound: all lie in
-    [margin, bound - margin]."""
+    [3, bound - 3]."""
     height, width = check_size(size)
-    extent = math.ceil(math.hypot(height, width) / pixels) + 2 * margin
+    extent = math.ceil(math.hypot(height, width) / pixels) + 6
     y, x = ((torch.arange(n) + (0.5 - 0.5 * n)) / pixels for n in (height, width))
     cos, sin = math.cos(angle), math.sin(angle)
     u, v = x * cos - y[:, None] * sin, x * sin + y[:, None] * cos
@@ -36,7 +36,7 @@ def fractal(
         pixels = max(size) / (cells * 2**octave)
         if octave and pixels < 2:
             break
-        uv, extent = lattice(size, pixels, draw.uniform(0, 2 * math.pi), margin=3)
+        uv, extent = lattice(size, pixels, draw.uniform(0, 2 * math.pi))
         if shift is not None:
             uv = uv + shift * min(2**octave, 2)
         table = torch.from_numpy(draw.uniform(-1, 1, (1, 1, extent, extent)).astype(np.float32))

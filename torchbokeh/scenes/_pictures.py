@@ -1,4 +1,7 @@
-"""Textures that are pictures of things: print, photographs, a town at night."""
+"""Textures that are pictures of things: print, photographs, a town at night.
+
+What they take, return and raise is as in `torchbokeh.scenes.textures`.
+"""
 
 import math
 from functools import lru_cache
@@ -9,8 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchbokeh.ops.checks import check_kind, check_size
 from torchbokeh.scenes._paint import draw_contrast
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.scenes._random import count_setting, rng, setting
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont
@@ -48,17 +52,8 @@ def text(size: tuple[int, int], seed: int, *, points: float | None = None, words
     """A printed page: lines of words, some of them large.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         points: height of the small print over the longer side, 0.01 to 1.
         words: what to write over and over, at least one visible character.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range, or no words.
 
     Example:
         >>> tuple(text((48, 64), seed=3, words="bokeh").shape)
@@ -69,8 +64,9 @@ def text(size: tuple[int, int], seed: int, *, points: float | None = None, words
     height, width = check_size(size)
     draw = rng(seed, "text")
     points = setting("points", points, draw.uniform(0.035, 0.08), 0.01, 1)
-    if words is not None and (not isinstance(words, str) or not words.strip()):
-        raise (ValueError if isinstance(words, str) else TypeError)(f"words: expected some text, got {words!r}")
+    check_kind("words", words, str, optional=True)
+    if words is not None and not words.strip():
+        raise ValueError(f"words: expected some text, got {words!r}")
     palette = draw_contrast(rng(seed, "text", "colours"), 3)
     masks = [Image.new("L", (width, height)) for _ in range(2)]
     pens = [ImageDraw.Draw(mask) for mask in masks]
@@ -96,13 +92,6 @@ def photograph(size: tuple[int, int], seed: int, *, name: str | None = None) -> 
             that is too small is enlarged.
         seed: draws the picture where none is named, the cut-out, and whether it is mirrored.
         name: one of `PHOTOGRAPHS`.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: an unknown name or a size below 1.
 
     Example:
         >>> tuple(photograph((48, 64), seed=3, name="coffee").shape)
@@ -135,18 +124,12 @@ def lights(size: tuple[int, int], seed: int, *, count: int | None = None, peak: 
     """A town at night: lit windows and lamps far brighter than 1 on dark ground.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         count: number of lamps, 1 to 10000; windows come on top.
         peak: the largest radiance, 1 to 1e6; None draws 10 to 100. Lamps range from a tenth of it upwards, windows
             up to a fifth.
 
     Returns:
         ``(3, H, W)`` in [0, peak], HDR.
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> lights((48, 64), seed=3, peak=50.0).max().item()

@@ -1,11 +1,10 @@
 """Seeds: the same key gives the same numbers in every process, and settings are given or drawn."""
 
 import hashlib
-from numbers import Integral
 
 import numpy as np
 
-from torchbokeh.ops.checks import check_size as check_size
+from torchbokeh.ops.checks import check_count, check_number, is_whole
 
 
 def rng(seed: int, *keys: int | str) -> np.random.Generator:
@@ -30,12 +29,12 @@ def rng(seed: int, *keys: int | str) -> np.random.Generator:
         >>> rng(7, "noise").integers(100) == rng(7, "noise").integers(100)
         np.True_
     """
-    if not isinstance(seed, Integral) or isinstance(seed, bool):
+    if not is_whole(seed):
         raise TypeError(f"seed: expected an int, got {type(seed).__name__}")
     if seed < 0:
         raise ValueError(f"seed: expected 0 or more, got {seed}")
     for key in keys:
-        if not isinstance(key, Integral | str) or isinstance(key, bool):
+        if not is_whole(key) and not isinstance(key, str):
             raise TypeError(f"keys: expected ints and strings, got {type(key).__name__}")
     # A digest of the written key: `SeedSequence` alone takes (1, 2) and (1 + 2 * 2**32,) for the same.
     written = ascii([str(key) if isinstance(key, str) else int(key) for key in (seed, *keys)])
@@ -44,60 +43,20 @@ def rng(seed: int, *keys: int | str) -> np.random.Generator:
 
 
 def setting(name: str, value: float | None, drawn: float, low: float, high: float) -> float:
-    """The setting the caller gave, checked, or else the one that was drawn.
-
-    Args:
-        name: of the argument, for the message.
-        value: what the caller passed; None takes ``drawn``.
-        drawn: what the seed says.
-        low: the least that is allowed.
-        high: the most that is allowed.
-
-    Returns:
-        One number.
-
-    Raises:
-        TypeError: not a number.
-        ValueError: out of range, or NaN.
+    """The setting ``value`` that the caller gave, checked as by `check_number`, or ``drawn`` where it is None.
 
     Example:
         >>> setting("warp", None, 0.5, 0, 2), setting("warp", 1, 0.5, 0, 2)
         (0.5, 1.0)
     """
-    if value is None:
-        return float(drawn)
-    if not isinstance(value, int | float | np.number) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    if not low <= value <= high:
-        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {value:g}")
-    return float(value)
+    return float(drawn) if value is None else check_number(name, value, low, high)
 
 
 def count_setting(name: str, value: int | None, drawn: int | np.integer, low: int, high: int) -> int:
-    """As :func:`setting`, for a whole number.
-
-    Args:
-        name: of the argument, for the message.
-        value: what the caller passed; None takes ``drawn``.
-        drawn: what the seed says.
-        low: the least that is allowed.
-        high: the most that is allowed.
-
-    Returns:
-        One integer.
-
-    Raises:
-        TypeError: not an integer.
-        ValueError: out of range.
+    """As :func:`setting`, for a whole number, checked as by `check_count`.
 
     Example:
         >>> count_setting("teeth", None, 12, 3, 64)
         12
     """
-    if value is None:
-        return int(drawn)
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-    if not low <= value <= high:
-        raise ValueError(f"{name}: expected {low} to {high}, got {value}")
-    return int(value)
+    return int(drawn) if value is None else check_count(name, value, low, high)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.scenes._random import check_size
+from torchbokeh.ops.checks import check_size
 
 
 def fill(size: tuple[int, int], *outlines: np.ndarray) -> Tensor:

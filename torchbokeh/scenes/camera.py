@@ -1,13 +1,12 @@
 """The camera that looks at a scene."""
 
 from dataclasses import dataclass
-from numbers import Real
 
 import torch
 from torch import Tensor
 
 from torchbokeh.lens import ThinLens
-from torchbokeh.scenes._random import check_size
+from torchbokeh.ops.checks import check_finite, check_kind, check_size
 
 
 @dataclass(frozen=True)
@@ -39,16 +38,12 @@ class Camera:
     shutter: float = 1 / 50
 
     def __post_init__(self) -> None:
-        if not isinstance(self.lens, ThinLens):
-            raise TypeError(f"lens: expected a ThinLens, got {type(self.lens).__name__}")
+        check_kind("lens", self.lens, ThinLens)
         for name, value in self.lens.values().items():
             if value.dim():
                 raise ValueError(f"lens: expected scalar parameters, got {name} of shape {tuple(value.shape)}")
         object.__setattr__(self, "size", check_size(self.size))
-        if not isinstance(self.shutter, Real) or isinstance(self.shutter, bool):
-            raise TypeError(f"shutter: expected seconds, got {self.shutter!r}")
-        if not 0 <= self.shutter < float("inf"):
-            raise ValueError(f"shutter: expected seconds, 0 or more, got {self.shutter}")
+        check_finite("shutter", self.shutter, 0)
 
     @property
     def focal_px(self) -> float:

@@ -15,15 +15,15 @@ class Fragments:
         left: first column.
         rgba: ``(4, h, w)`` premultiplied.
         depth: ``(1, h, w)`` metres, also beyond the card.
-        way: ``(4, h, w)`` from the opening to the closing of the shutter: the displacement (dx, dy) in px, and what is
-            to be added to one over the depth at both moments.
+        motion: ``(4, h, w)`` from the opening to the closing of the shutter: the displacement (dx, dy) in px, and what
+            is to be added to one over the depth at both moments.
     """
 
     top: int
     left: int
     rgba: Tensor
     depth: Tensor
-    way: Tensor
+    motion: Tensor
 
     @property
     def place(self) -> tuple[slice, slice, slice]:
@@ -39,49 +39,46 @@ def stack_layers(cards: list[Fragments], most: int | None, size: tuple[int, int]
     count = max(chosen, default=-1) + 1
     rgba = torch.zeros(count, 4, *size, device=device)
     depth = torch.full((count, 1, *size), torch.inf, device=device)
-    way = torch.zeros(count, 4, *size, device=device)
+    motion = torch.zeros(count, 4, *size, device=device)
     for card, k in zip(cards, chosen, strict=True):
         there = card.rgba[3:] > 0
-        for whole, part in ((rgba[k], card.rgba), (depth[k], card.depth), (way[k], card.way)):
+        for whole, part in ((rgba[k], card.rgba), (depth[k], card.depth), (motion[k], card.motion)):
             inside = whole[card.place]
             inside.copy_(torch.where(there, part, inside))
     if cross:
-        _sort_pixels(rgba, depth, way)
+        _sort_pixels(rgba, depth, motion)
     if most is not None and count > most:
-        flat = [t[None] for t in flatten(rgba[most - 1 :], depth[most - 1 :], way[most - 1 :])]
-        rgba, depth, way = (torch.cat([t[: most - 1], f]) for t, f in zip((rgba, depth, way), flat, strict=True))
-    picture, front, moved = flatten(rgba, depth, way)
+        flat = [t[None] for t in flatten(rgba[most - 1 :], depth[most - 1 :], motion[most - 1 :])]
+        rgba, depth, motion = (torch.cat([t[: most - 1], f]) for t, f in zip((rgba, depth, motion), flat, strict=True))
+    picture, front, moved = flatten(rgba, depth, motion)
     return {
         **{"image": picture[:3], "alpha": picture[3:], "depth": front, "motion": moved[:2]},
-        **{"shutter_depth": _ends(front, moved), "layers": rgba, "layer_depth": depth, "layer_motion": way[:, :2]},
-        "layer_shutter_depth": _ends(depth, way),
+        **{"shutter_depth": _ends(front, moved), "layers": rgba, "layer_depth": depth, "layer_motion": motion[:, :2]},
+        "layer_shutter_depth": _ends(depth, motion),
     }
 
 
-def _ends(depth: Tensor, way: Tensor) -> Tensor:
+def _ends(depth: Tensor, motion: Tensor) -> Tensor:
     """Depth ``(..., 2, H, W)`` when the shutter opens and when it closes."""
-    return (depth.reciprocal() + way[..., 2:, :, :]).clamp_min(0).reciprocal()
+    return (depth.reciprocal() + motion[..., 2:, :, :]).clamp_min(0).reciprocal()
 
 
-def flatten(rgba: Tensor, depth: Tensor, way: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Put layers over one another, front to back; depth and way are those of what is seen most of.
+def flatten(rgba: Tensor, depth: Tensor, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Put layers over one another, front to back; depth and motion are those of what is seen most of.
 
     Args:
         rgba: ``(L, 4, H, W)`` premultiplied.
         depth: ``(L, 1, H, W)``.
-        way: ``(L, E, H, W)``.
+        motion: ``(L, E, H, W)``.
 
     Returns:
-        ``(4, H, W)``, ``(1, H, W)`` and ``(E, H, W)``; where nothing is seen, depth ``inf`` and no way.
+        ``(4, H, W)``, ``(1, H, W)`` and ``(E, H, W)``; where nothing is seen, depth ``inf`` and no motion.
     """
-    left = torch.ones_like(rgba[0, 3:]) if len(rgba) else rgba.new_ones(1, *rgba.shape[2:])
-    picture, front, moved = (
-        0 * left.expand(4, -1, -1),
-        torch.full_like(left, torch.inf),
-        0 * left.expand(way.shape[1], -1, -1),
-    )
-    most = 0 * left
-    for colour, z, moves in zip(rgba, depth, way, strict=True):
+    size = rgba.shape[2:]
+    left, most = rgba.new_ones(1, *size), rgba.new_zeros(1, *size)
+    picture, front = rgba.new_zeros(4, *size), rgba.new_full((1, *size), torch.inf)
+    moved = motion.new_zeros(motion.shape[1:])
+    for colour, z, moves in zip(rgba, depth, motion, strict=True):
         visible = left * colour[3:]
         nearer = visible > most
         front, moved = torch.where(nearer, z, front), torch.where(nearer, moves, moved)
@@ -140,11 +137,11 @@ def _order(cards: list[Fragments], a: int, b: int) -> list[tuple[int, int]]:
     return [(a, b), (b, a)] if bool((both & (first[1] <= second[1])).any()) else [(b, a)]
 
 
-def _sort_pixels(rgba: Tensor, depth: Tensor, way: Tensor) -> None:
+def _sort_pixels(rgba: Tensor, depth: Tensor, motion: Tensor) -> None:
     """Bring the layers of every pixel into the order of their depth, in place; empty ones stay where they are."""
     for i in range(len(rgba)):
         for j in range(i + 1, len(rgba)):
             swap = (rgba[i, 3:] > 0) & (rgba[j, 3:] > 0) & (depth[i] > depth[j])
             if bool(swap.any()):
-                for t in (rgba, depth, way):
+                for t in (rgba, depth, motion):
                     t[i], t[j] = torch.where(swap, t[j], t[i]), torch.where(swap, t[i], t[j])

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.ops.checks import MOST_PIXELS, check_whole
+from torchbokeh.ops.checks import MOST_PIXELS, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.planes import Plates, pixel_centres
 from torchbokeh.ops.sampling import aperture_points
@@ -51,9 +51,8 @@ def samples(scene: Scene, camera: Camera, per_pixel: int = 1, seed: int = 0) -> 
         >>> samples(*scenes.coins(size=(24, 32)), per_pixel=4).colour.shape
         torch.Size([1, 4, 3, 24, 32])
     """
-    for name, value, kind in (("scene", scene, Scene), ("camera", camera, Camera)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
+    check_kind("scene", scene, Scene)
+    check_kind("camera", camera, Camera)
     if len(scene) == 0:
         raise ValueError("scene: expected at least one card or a backdrop, got none")
     height, width = camera.size
@@ -101,7 +100,7 @@ def _hits(scene: Scene, plates: Plates, camera: Camera, rays: Tensor) -> Tensor:
 
     found = chosen(rgba)
     coc = camera.lens.coc(chosen(depth[..., None]).to(camera.lens.focus_distance), camera.size[1]).to(found)
-    motion = _ways(scene, camera, card[:, 0], chosen(texel))
+    motion = _motion(scene, camera, card[:, 0], chosen(texel))
     return torch.cat([hit.double(), found[:, :3] / found[:, 3:].clamp_min(TINY), coc, motion], 1)
 
 
@@ -124,7 +123,7 @@ def _first(alpha: Tensor, depth: Tensor, number: Tensor) -> tuple[Tensor, Tensor
     return order.gather(1, stopped.int().argmax(1, keepdim=True)), stopped.any(1, keepdim=True)
 
 
-def _ways(scene: Scene, camera: Camera, card: Tensor, texel: Tensor) -> Tensor:
+def _motion(scene: Scene, camera: Camera, card: Tensor, texel: Tensor) -> Tensor:
     """The way ``(N, 2)`` in px of texels ``(N, 3)`` of their cards ``(N,)`` while the shutter is open."""
     middle = torch.zeros(2, 2, dtype=torch.float64)
     matrices = scene.homographies(camera, middle, torch.tensor([-0.5, 0.5], dtype=torch.float64), middle)

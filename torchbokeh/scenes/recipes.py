@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Callable
-from numbers import Real
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchbokeh.lens import ThinLens
-from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.checks import check_finite, check_size, check_whole
 from torchbokeh.scenes import shapes, textures
-from torchbokeh.scenes._random import check_size, rng
+from torchbokeh.scenes._random import rng
 from torchbokeh.scenes.camera import Camera
 from torchbokeh.scenes.scene import Scene
 from torchbokeh.scenes.sprite import Backdrop, Sprite, place
@@ -31,10 +30,8 @@ class Studio:
     """
 
     def __init__(self, name: str, seed: int, size: tuple[int, int], focus: float, blur: float | None) -> None:
-        if blur is not None and (not isinstance(blur, Real) or isinstance(blur, bool)):
-            raise TypeError(f"blur: expected a radius in px or None, got {blur!r}")
-        if blur is not None and not 0 <= blur < math.inf:
-            raise ValueError(f"blur: expected a radius in px, 0 or more, or None, got {blur}")
+        if blur is not None:
+            check_finite("blur", blur, 0)
         self.draw = rng(seed, name)
         self.size = check_size(size)
         self.focus = focus

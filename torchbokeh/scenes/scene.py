@@ -1,14 +1,13 @@
 """Scenes of textured cards, and the pinhole picture that a renderer starts from."""
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.checks import check_kind, check_whole
 from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.planes import Plates, pixel_centres, render_planes
 from torchbokeh.scenes.camera import Camera
@@ -53,8 +52,7 @@ class Scene:
         for sprite in self.sprites:
             if not isinstance(sprite, Sprite):
                 raise TypeError(f"sprites: expected Sprites, got {type(sprite).__name__}")
-        if self.backdrop is not None and not isinstance(self.backdrop, Backdrop):
-            raise TypeError(f"backdrop: expected a Backdrop or None, got {type(self.backdrop).__name__}")
+        check_kind("backdrop", self.backdrop, Backdrop, optional=True)
 
     def __len__(self) -> int:
         """How many planes there are, the backdrop included."""
@@ -123,11 +121,10 @@ class Scene:
             TypeError: ``camera`` is no `Camera`, or a number is no int.
             ValueError: ``samples`` or ``layers`` is not positive, or ``samples`` above `MOST_SAMPLES`.
         """
-        if not isinstance(camera, Camera):
-            raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
+        check_kind("camera", camera, Camera)
         check_whole("samples", samples, 1, MOST_SAMPLES)
         if layers is not None:
-            check_whole("layers", layers, 1, sys.maxsize)
+            check_whole("layers", layers, 1)
         return stack_layers(self._fragments(camera, samples), layers, camera.size)
 
     def _fragments(self, camera: Camera, samples: int) -> list[Fragments]:
@@ -149,8 +146,8 @@ class Scene:
             level = torch.full((len(grid), 1), lod)
             rgba, _ = render_planes(one, inverse3(several)[:, None], level, (bottom - top, right - left))
             if bool((rgba[0, 3] > 0).any()):
-                depth, way = _geometry(three, rgba, one)
-                found.append(Fragments(top, left, rgba[0], depth, way))
+                depth, motion = _geometry(three, rgba, one)
+                found.append(Fragments(top, left, rgba[0], depth, motion))
         return found
 
 
@@ -185,7 +182,7 @@ def _corners(height: float, width: float, rim: float = 0.0) -> Tensor:
 
 
 def _geometry(matrices: Tensor, rgba: Tensor, plate: Plates) -> tuple[Tensor, Tensor]:
-    """Depth and way of a card at the centres of the pixels, from its homographies half way, before and after."""
+    """Depth and motion of a card at the centres of the pixels, from its homographies half way, before and after."""
     h, w = rgba.shape[2:]
     if plate.infinite[0]:
         return rgba.new_full((1, h, w), torch.inf), rgba.new_zeros(4, h, w)

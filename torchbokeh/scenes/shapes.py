@@ -1,8 +1,10 @@
 """Shapes: how much of each texel of a card is covered.
 
-Every shape takes the size of the card, a seed, and settings that are drawn from the seed where they are None.
-Its outermost texels are empty, so that a card sampled bilinearly ends in nothing. Outlines are polygons with
-exact area coverage; round ones have 512 corners, off by less than 1/100 texel on cards of up to 1000 texels.
+Every shape takes the size (H, W) of the card in texels, a seed, and settings that are drawn from the seed where they
+are None. It returns the coverage ``(1, H, W)``, float32 in [0, 1]. It raises a TypeError for an argument of the wrong
+kind, and a ValueError for one out of its range. The outermost texels are empty, so that a card sampled bilinearly ends
+in nothing. Outlines are polygons with exact area coverage; round ones have 512 corners, off by less than 1/100 texel on
+cards of up to 1000 texels.
 """
 
 import math
@@ -13,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.checks import check_image
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_size
+from torchbokeh.scenes._random import count_setting, rng, setting
 from torchbokeh.scenes._raster import fill
 
 if TYPE_CHECKING:
@@ -25,15 +27,7 @@ def disc(size: tuple[int, int], seed: int = 0) -> Tensor:
     """A disc in the middle of the card; its radius is ``min(H, W) / 2 - 1`` texels.
 
     Args:
-        size: (H, W) in texels.
         seed: not used, there is only one disc.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: ``size`` or ``seed`` is not of integers.
-        ValueError: a size below 1 or a negative seed.
 
     Example:
         >>> round(disc((4, 4)).sum().item(), 2)
@@ -48,15 +42,7 @@ def ring(size: tuple[int, int], seed: int = 0, *, inner: float | None = None) ->
 
     Args:
         size: (H, W) in texels; the outer radius is ``min(H, W) / 2 - 1``.
-        seed: draws what is None.
         inner: radius of the hole over the outer radius, 0 to 1.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> ring((9, 9), inner=0.5)[0, 4, 4].item()
@@ -84,13 +70,6 @@ def polygon(
         depth: 0 is the convex polygon; the notches of a star reach from its edges this share of the way to
             the centre, below 1.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
-
     Example:
         >>> polygon((34, 34), corners=4, rotation=0.0, depth=0.0).sum().item()  # 2 r²
         512.0
@@ -112,13 +91,6 @@ def leaf(size: tuple[int, int], seed: int = 0, *, lobes: int | None = None, slen
         seed: draws what is None, and the bend, the teeth along the edge and the rotation.
         lobes: lobes on each side, 0 (entire) to 8, as an oak's.
         slenderness: length over width, 1 to 8.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(leaf((64, 48), seed=3).shape)
@@ -157,13 +129,6 @@ def gear(size: tuple[int, int], seed: int = 0, *, teeth: int | None = None, hole
         teeth: 4 to 64.
         hole: radius of the hole over the outer radius, 0 to 0.6.
 
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
-
     Example:
         >>> gear((33, 33), teeth=12, hole=0.2)[0, 16, 16].item()
         0.0
@@ -200,18 +165,10 @@ def grid(
     """A lattice over the whole card: bars, or a diagonal wire fence.
 
     Args:
-        size: (H, W) in texels.
         seed: draws what is None, and the phase.
         pitch: distance between bars over the shorter side of the card, 0.02 to 1.
         bar: width of a bar over the pitch, 0.01 to 0.9.
         diagonal: False for upright and level bars, True for the diamonds of a chain-link fence.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> 0.3 < grid((128, 128), pitch=0.25, bar=0.25, diagonal=False).mean() < 0.5
@@ -222,9 +179,7 @@ def grid(
     pitch = setting("pitch", pitch, draw.uniform(0.1, 0.25), 0.02, 1)
     bar = setting("bar", bar, draw.uniform(0.12, 0.3), 0.01, 0.9)
     drawn = bool(draw.integers(2))
-    if not isinstance(diagonal, bool | None):
-        raise TypeError(f"diagonal: expected True or False, got {type(diagonal).__name__}")
-    diagonal = drawn if diagonal is None else diagonal
+    diagonal = drawn if diagonal is None else check_flag("diagonal", diagonal)
     phases = draw.uniform(0, 1, 2)
     step = pitch * min(height, width)
     reach = 0.5 * math.hypot(height, width)
@@ -242,16 +197,8 @@ def glyph(size: tuple[int, int], seed: int = 0, *, characters: str | None = None
     """Letters, as large as fit into the card.
 
     Args:
-        size: (H, W) in texels.
         seed: draws a single character where none is given.
         characters: what to write, on one line, in Pillow's own font.
-
-    Returns:
-        ``(1, H, W)`` float32 in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: ``characters`` is empty or has nothing to see.
 
     Example:
         >>> tuple(glyph((48, 64), characters="Hi").shape)
@@ -262,8 +209,7 @@ def glyph(size: tuple[int, int], seed: int = 0, *, characters: str | None = None
     height, width = check_size(size)
     drawn = "ABCDEFGHJKMNPQRSTUVWXYZabdefghkmnqrstwxyz2345678&@#?%"[rng(seed, "glyph").integers(53)]
     characters = drawn if characters is None else characters
-    if not isinstance(characters, str):
-        raise TypeError(f"characters: expected a string, got {type(characters).__name__}")
+    check_kind("characters", characters, str)
     ink = _ink(characters, 256.0) if characters and "\n" not in characters else None
     if ink is None:
         raise ValueError(f"characters: expected something visible on one line, got {characters!r}")
@@ -282,15 +228,7 @@ def rectangle(size: tuple[int, int], seed: int = 0) -> Tensor:
     """The whole card but its outermost texels.
 
     Args:
-        size: (H, W) in texels.
         seed: not used, there is only one rectangle.
-
-    Returns:
-        ``(1, H, W)`` float32, 0 or 1.
-
-    Raises:
-        TypeError: ``size`` or ``seed`` is not of integers.
-        ValueError: a size below 1 or a negative seed.
 
     Example:
         >>> rectangle((3, 4)).tolist()
@@ -348,9 +286,9 @@ def _ink(characters: str, points: float) -> "Image | None":
     return picture.crop(box) if box else None
 
 
-def _circle(corners: int = 512) -> np.ndarray:
+def _circle() -> np.ndarray:
     """The unit circle."""
-    angle = np.arange(corners) * (2 * math.pi / corners)
+    angle = np.arange(512) * (2 * math.pi / 512)
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 

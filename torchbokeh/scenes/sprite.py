@@ -3,12 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from numbers import Real
 
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.checks import check_image
+from torchbokeh.ops.checks import check_finite, check_image, check_number, is_number
 
 Vector = tuple[float, float, float]
 
@@ -54,8 +53,7 @@ class Sprite:
                 raise ValueError(f"{name}: expected three finite numbers, got {value}")
         if len(_numbers("size", self.size)) != 2 or not all(0 < v < math.inf for v in self.size):
             raise ValueError(f"size: expected a width and a height above 0 in metres, got {self.size}")
-        if not 0 <= _number("emission", self.emission) < math.inf:
-            raise ValueError(f"emission: expected a factor, 0 or more, got {self.emission}")
+        check_finite("emission", self.emission, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +79,13 @@ class Backdrop:
 
     def __post_init__(self) -> None:
         _check_texture(self.texture, 3)
-        if not _number("distance", self.distance) > 0:
+        if not check_number("distance", self.distance) > 0:
             raise ValueError(f"distance: expected metres above 0, or inf, got {self.distance}")
-        if not 0 < _number("width", self.width) < math.inf:
-            raise ValueError(f"width: expected a width above 0 for each metre of distance, got {self.width}")
-
-
-def _number(name: str, value: object) -> float:
-    if not isinstance(value, Real) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected a number, got {value!r}")
-    return float(value)
+        check_finite("width", self.width, 0, above=True)
 
 
 def _numbers(name: str, value: object) -> Sequence[float]:
-    if not isinstance(value, Sequence) or not all(isinstance(v, Real) for v in value):
+    if not isinstance(value, Sequence) or not all(is_number(v) for v in value):
         raise TypeError(f"{name}: expected a tuple of numbers, got {value!r}")
     return value
 

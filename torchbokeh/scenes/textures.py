@@ -1,8 +1,9 @@
 """Textures: pictures of any size, made from a seed.
 
-Every texture takes the size, a seed, and settings that are drawn from the seed where they are None, and returns
-``(3, H, W)`` float32 linear radiance, non-negative, in [0, 1] but for :func:`lights`. Lengths are relative to the
-longer side, so that a larger picture shows the same things larger; edges are anti-aliased.
+Every texture takes the size (H, W) in pixels, a seed, and settings that are drawn from the seed where they are None. It
+returns ``(3, H, W)`` float32 linear radiance, non-negative, in [0, 1] but for :func:`lights`. It raises a TypeError for
+an argument of the wrong kind, and a ValueError for one out of its range. Lengths are relative to the longer side, so
+that a larger picture shows the same things larger; edges are anti-aliased.
 """
 
 import math
@@ -12,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchbokeh.ops.checks import check_size
 from torchbokeh.scenes._paint import draw_contrast, draw_palette, fractal, lattice, linear_hsv, ramp
 from torchbokeh.scenes._pictures import lights, photograph, text
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.scenes._random import count_setting, rng, setting
 from torchbokeh.scenes._raster import fill, stroke
 
 
@@ -31,20 +33,11 @@ def noise(
     """Clouds, marble, rust: octaves of smooth value noise through a ramp of colours.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         octaves: 1 to 10, each twice as fine; those finer than two pixels are left out.
         cells: features of the coarsest octave along the longer side, 0.5 to 64.
         roughness: weight of an octave over that of the one before, 0 to 1.
         warp: how far coarse noise displaces the fine, in cells, 0 to 4.
         colours: colours of the ramp, 2 to 16.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(noise((48, 64), seed=3, octaves=4).shape)
@@ -81,18 +74,9 @@ def voronoi(
     """Cells of random colours, as of pebbles, cracked mud or stained glass.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         cells: cells along the longer side, 1 to 200.
         border: width of the border over the size of a cell, 0 (none) to 0.5.
         shading: how much darker a cell is at its border, 0 to 1.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(voronoi((48, 64), seed=3, cells=5).shape)
@@ -103,7 +87,7 @@ def voronoi(
     border = setting("border", border, max(0.0, draw.uniform(-0.12, 0.16)), 0, 0.5)
     shading = setting("shading", shading, max(0.0, draw.uniform(-0.5, 0.8)), 0, 1)
     pixels = max(check_size(size)) / cells
-    (u, v), extent = lattice(size, pixels, draw.uniform(0, math.pi), margin=3)
+    (u, v), extent = lattice(size, pixels, draw.uniform(0, math.pi))
     # One site per lattice cell, jittered so little that all that matter are in the 3 x 3 cells around a pixel.
     jitter = torch.from_numpy(draw.uniform(0.1, 0.9, (2, extent * extent)).astype(np.float32))
     site_u = jitter[0] + torch.arange(extent).repeat(extent)
@@ -149,18 +133,9 @@ def brick(
     """A wall of bricks with mortar between them.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         rows: rows of bricks along the longer side, 1 to 200.
         mortar: width of the joints over the height of a row, 0 to 0.5.
         variation: how much bricks differ from one another, 0 to 1.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(brick((48, 64), seed=3, rows=6).shape)
@@ -172,7 +147,7 @@ def brick(
     variation = setting("variation", variation, draw.uniform(0.3, 1), 0, 1)
     pixels = max(check_size(size)) / rows
     aspect = draw.choice([1.0, 2.0, 2.4, 3.0])
-    (u, v), extent = lattice(size, pixels, 0.0, margin=3)
+    (u, v), extent = lattice(size, pixels, 0.0)
     u, v = u + draw.uniform(), v + draw.uniform()
     row = v.floor()
     u = u / aspect + (0.5 if aspect > 1 else 0.0) * (row % 2)
@@ -193,27 +168,13 @@ def brick(
     return torch.lerp(picture, ground, joint).clamp(0, 1)
 
 
-def checker(
-    size: tuple[int, int],
-    seed: int,
-    *,
-    cells: float | None = None,
-    rotation: float | None = None,
-) -> Tensor:
+def checker(size: tuple[int, int], seed: int, *, cells: float | None = None, rotation: float | None = None) -> Tensor:
     """A chessboard of two colours.
 
     Args:
-        size: (H, W) in pixels.
         seed: draws what is None, and the phase.
         cells: squares along the longer side, 1 to 200.
         rotation: radians, counter-clockwise as seen in the image.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(checker((48, 64), seed=3, cells=8, rotation=0.0).shape)
@@ -223,7 +184,7 @@ def checker(
     cells = setting("cells", cells, math.exp(draw.uniform(math.log(4), math.log(20))), 1, 200)
     rotation = setting("rotation", rotation, draw.choice([0.0, draw.uniform(-0.8, 0.8)]), -1e3, 1e3)
     pixels = max(check_size(size)) / cells
-    uv, _ = lattice(size, pixels, rotation, margin=3)
+    uv, _ = lattice(size, pixels, rotation)
     side = torch.ones(size)
     for t, phase in zip(uv, draw.uniform(0, 2, 2), strict=True):
         # Signed distance to the next line: positive in every second stripe.
@@ -244,19 +205,10 @@ def dead_leaves(
     """Discs that fall on one another, with the edge statistics of natural pictures.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         count: number of discs, 1 to 10000; the first fall on noise.
         smallest: least radius over the longer side, 0.002 to 0.2; the greatest is 0.3.
         exponent: the density of a radius falls with this power of it, 1.5 to 5; 3 makes the picture look the
             same at every scale.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Source: A. Lee, D. Mumford, J. Huang, Occlusion models for natural images, 2001.
 
@@ -294,17 +246,8 @@ def line_art(size: tuple[int, int], seed: int, *, strokes: int | None = None, wi
     """A drawing in ink: curves, circles and hatched patches.
 
     Args:
-        size: (H, W) in pixels.
-        seed: draws what is None.
         strokes: number of things drawn, 1 to 500.
         width: width of the pen over the longer side, 0.001 to 0.1.
-
-    Returns:
-        ``(3, H, W)`` in [0, 1].
-
-    Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: a number out of range.
 
     Example:
         >>> tuple(line_art((48, 64), seed=3, strokes=10).shape)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils.data import Dataset
 
-import torchbokeh.scenes
+import torchbokeh.datasets
 from torchbokeh.commands.main import main
 
 
@@ -39,7 +39,7 @@ class Fake(Dataset):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(torchbokeh.scenes, "ProceduralDataset", Fake, raising=False)
+    monkeypatch.setattr(torchbokeh.datasets, "ProceduralDataset", Fake)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -131,10 +131,10 @@ def test_ctrl_c_leaves_whole_shards(folder):
     flags = ["dataset", "--out", "set", "--count", "40", "--per-shard", "4", "--workers", "2"]
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        f"import torchbokeh.scenes, test_cli_dataset\n"
-        f"torchbokeh.scenes.ProceduralDataset = test_cli_dataset.Fake\n"
-        f"test_cli_dataset.Fake.seconds = 0.2\n"
-        f"sys.exit(test_cli_dataset.main({flags}))"
+        f"import torchbokeh.datasets, test_dataset\n"
+        f"torchbokeh.datasets.ProceduralDataset = test_dataset.Fake\n"
+        f"test_dataset.Fake.seconds = 0.2\n"
+        f"sys.exit(test_dataset.main({flags}))"
     )
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, start_new_session=True) as process:
         deadline = time.monotonic() + 100

@@ -12,7 +12,6 @@ import torch
 
 import torchbokeh as tb
 from torchbokeh.commands.main import main
-from torchbokeh.commands.scene import _length
 from torchbokeh.io.pictures import read_image, write_image
 
 
@@ -116,13 +115,6 @@ def test_dispersion(scene, flags, dispersion):
 def test_focus_at_infinity(scene):
     assert main(["render", "image.tif", "--depth", "depth.npy", "--focus", "inf", "-o", "out.png"]) == 0
     assert (scene / "out.png").exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "metres"), [("50mm", 0.05), ("3.6cm", 0.036), ("2m", 2), ("2", 2), (" 2.5 m ", 2.5), ("1e3mm", 1)]
-)
-def test_lengths_have_units(text, metres):
-    assert _length(text) == pytest.approx(metres)
 
 
 BAD_FLAGS = [
@@ -254,7 +246,7 @@ def test_a_message_of_several_lines_becomes_one(scene, capsys, monkeypatch):
     def fail(path):
         raise OSError("one\ntwo")
 
-    monkeypatch.setattr("torchbokeh.commands.scene.read_image", fail)
+    monkeypatch.setattr("torchbokeh.commands.picture_flags.read_image", fail)
     assert_refused(scene, capsys, ["render", "image.tif", *THIN, "-o", "out.png"], "torchbokeh: one two\n")
 
 
@@ -266,7 +258,7 @@ def test_interruption_and_full_gpu(scene, capsys, monkeypatch, error, status, me
     def fail(path):
         raise error
 
-    monkeypatch.setattr("torchbokeh.commands.scene.read_image", fail)
+    monkeypatch.setattr("torchbokeh.commands.picture_flags.read_image", fail)
     assert render(*THIN) == status
     assert capsys.readouterr().err.startswith(f"torchbokeh: {message}")
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
 import torchbokeh.datasets.dataset as dataset
-from torchbokeh import AccumulationBuffer, ThinLens
+from torchbokeh import AccumulationBuffer, ThinLens, datasets, scenes
 from torchbokeh.scenes import RECIPES, Camera, ProceduralDataset, Scene
 
 H, W = 12, 16
@@ -292,3 +292,11 @@ def test_length_and_indices() -> None:
 def test_errors(wrong: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         small(**wrong)
+
+
+def test_scenes_forward_the_data_sets() -> None:
+    names = ("ProceduralDataset", "read_shards", "write_shards")
+    assert all(getattr(scenes, name) is getattr(datasets, name) for name in names)
+    assert {*scenes.__all__} <= {*dir(scenes)}
+    with pytest.raises(AttributeError, match=r"module 'torchbokeh\.scenes' has no attribute 'nothing'"):
+        scenes.nothing  # noqa: B018

@@ -65,7 +65,7 @@ def test_cards_that_cross() -> None:
     for x in range(6):
         front, back = (cards[0], cards[1]) if x < 3 else (cards[1], cards[0])
         for layer, card in zip((0, 1), (front, back), strict=True):
-            for name, want in (("layers", card.rgba), ("layer_depth", card.depth), ("layer_motion", card.way[:2])):
+            for name, want in (("layers", card.rgba), ("layer_depth", card.depth), ("layer_motion", card.motion[:2])):
                 assert torch.equal(seen[name][layer][:, :, x], want[:, :, x])
 
 

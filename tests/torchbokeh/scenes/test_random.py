@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import torchbokeh.scenes._random
-from torchbokeh.scenes._random import check_size, count_setting, rng, setting
+from torchbokeh.scenes._random import count_setting, rng, setting
 
 
 def test_the_numbers_of_a_key_never_change() -> None:
@@ -63,16 +63,6 @@ def test_bad_keys_are_named() -> None:
         rng(-1)
     with pytest.raises(TypeError, match="keys: expected ints and strings, got NoneType"):
         rng(1, None)  # type: ignore[arg-type]
-
-
-def test_sizes() -> None:
-    assert check_size((3, 5)) == (3, 5)
-    assert check_size([np.int64(3), 5]) == (3, 5)
-    for bad in ((3,), (1, 2, 3), (1.0, 2), 5, "35", (True, 2), None):
-        with pytest.raises(TypeError, match=r"size: expected two integers \(H, W\), got"):
-            check_size(bad)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"size: expected \(H, W\) of at least 1, got \(0, 5\)"):
-        check_size((0, 5))
 
 
 def test_settings() -> None:

@@ -1,12 +1,11 @@
 """What the commands that blur a picture share: the flags of picture, depth, lens and blur, and how they are read."""
 
 import argparse
-import math
-import re
 from pathlib import Path
 
 from torch import Tensor
 
+from torchbokeh.commands.arguments import count, finite, length, pixel, positive
 from torchbokeh.io.pictures import read_image, read_map, sample_map
 from torchbokeh.lens import DisparityLens, ThinLens
 from torchbokeh.lens.dispersion import Dispersion
@@ -14,12 +13,11 @@ from torchbokeh.plan.quality import QUALITIES
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.renderers.lens_blur import LensBlur
 
-_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "": 1.0}
 _DISPERSION_FLAGS = ("dispersion", "lateral", "glass", "spectrum")
 _THIN_LENS_FLAGS = ("focus", "f_number", "focal_length", "sensor_width", "depth_scale", *_DISPERSION_FLAGS)
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
+def add_picture_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a picture, its depth, what it is seen through and how it is blurred."""
     parser.description = "Lengths are metres, or carry a unit: 50mm, 3.6cm, 2m. The depth has the image's size."
     add = parser.add_argument
@@ -28,14 +26,14 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     maps.add_argument("--depth", type=Path, metavar="FILE", help="distance along the optical axis")
     maps.add_argument("--disparity", type=Path, metavar="FILE", help="larger is nearer; needs --strength")
     focus = parser.add_mutually_exclusive_group(required=True)
-    focus.add_argument("--focus", type=_length, metavar="LENGTH", help="focus distance; inf for infinity")
-    focus.add_argument("--focus-at", type=_pixel, metavar="X,Y", help="focus on what this pixel shows")
+    focus.add_argument("--focus", type=length, metavar="LENGTH", help="focus distance; inf for infinity")
+    focus.add_argument("--focus-at", type=pixel, metavar="X,Y", help="focus on what this pixel shows")
     focus.add_argument("--focus-disparity", type=finite, metavar="D", help="focus on this disparity")
-    add("--depth-scale", type=_positive, metavar="S", help="metres per unit of the stored depth (default 1)")
-    add("--f-number", type=_positive, metavar="N", help="small is blurry (default 2.8)")
-    add("--focal-length", type=_length, metavar="LENGTH", help="default 50mm")
-    add("--sensor-width", type=_length, metavar="LENGTH", help="default 36mm")
-    add("--strength", type=_positive, metavar="PX", help="blur radius in pixels per unit of disparity")
+    add("--depth-scale", type=positive, metavar="S", help="metres per unit of the stored depth (default 1)")
+    add("--f-number", type=positive, metavar="N", help="small is blurry (default 2.8)")
+    add("--focal-length", type=length, metavar="LENGTH", help="default 50mm")
+    add("--sensor-width", type=length, metavar="LENGTH", help="default 36mm")
+    add("--strength", type=positive, metavar="PX", help="blur radius in pixels per unit of disparity")
     add(
         "--aperture",
         type=_aperture,
@@ -43,15 +41,15 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         metavar="SHAPE",
         help="disc, or a polygon such as 6-gon (default disc)",
     )
-    add("--max-coc", type=_positive, metavar="PX", help="limit the blur radius (default: no limit)")
+    add("--max-coc", type=positive, metavar="PX", help="limit the blur radius (default: no limit)")
     add("--layers", type=_layers, default="auto", metavar="N", help="depth layers (default auto)")
     grade = parser.add_mutually_exclusive_group()
     names = [quality.name for quality in QUALITIES]
     grade.add_argument("--quality", choices=names, default="exact", help="default exact; the others are faster")
-    grade.add_argument("--tolerance", type=_positive, metavar="E", help="the fastest quality to this relative error")
+    grade.add_argument("--tolerance", type=positive, metavar="E", help="the fastest quality to this relative error")
 
 
-def read_scene(args: argparse.Namespace) -> tuple[Tensor, Tensor, LensBlur]:
+def read_picture(args: argparse.Namespace) -> tuple[Tensor, Tensor, LensBlur]:
     """The picture, its depth or disparity, and the blur that the flags ask for."""
     image = read_image(args.image)
     depth = _read_depth(args, image)
@@ -66,7 +64,7 @@ def refuse_overwriting(args: argparse.Namespace, *others: Path | None) -> None:
             raise ValueError(f"{args.output}: is what is read as well; write to another file")
 
 
-def check_flags(args: argparse.Namespace) -> None:
+def refuse_unused_flags(args: argparse.Namespace) -> None:
     """Refuse flags that the chosen kind of map would leave unused."""
     unused = _THIN_LENS_FLAGS if args.disparity else ("strength", "focus_disparity")
     for name in unused:
@@ -82,12 +80,17 @@ def check_flags(args: argparse.Namespace) -> None:
         raise ValueError("--disparity needs --strength, the blur radius in pixels per unit of disparity")
 
 
+def check_same_size(path: Path, values: Tensor, image_path: Path, image: Tensor) -> None:
+    """Raise a ValueError unless a map ``(1, C, H, W)`` that was read has the size of the image."""
+    if values.shape[2:] != image.shape[2:]:
+        (h, w), (ih, iw) = values.shape[2:], image.shape[2:]
+        raise ValueError(f"{path}: is {w} x {h}, but {image_path} is {iw} x {ih}; resize one to the other")
+
+
 def _read_depth(args: argparse.Namespace, image: Tensor) -> Tensor:
     path = args.depth or args.disparity
     values = read_map(path, args.depth_scale or 1.0)
-    if values.shape[2:] != image.shape[2:]:
-        (h, w), (ih, iw) = values.shape[2:], image.shape[2:]
-        raise ValueError(f"{path}: is {w} x {h}, but {args.image} is {iw} x {ih}; resize one to the other")
+    check_same_size(path, values, args.image, image)
     bad = ~(values > 0) if args.depth else ~values.isfinite()
     if bad.any():
         y, x = bad[0, 0].nonzero()[0].tolist()
@@ -119,62 +122,6 @@ def _dispersion(args: argparse.Namespace) -> Dispersion | None:
         return None
     strengths = args.dispersion or 0.0, args.lateral or 0.0
     return Dispersion(args.glass or "BK7", *strengths, spectrum=args.spectrum or "rgb")
-
-
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if math.isnan(value):
-        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
-    return value
-
-
-def finite(text: str) -> float:
-    """The value of a flag that is a finite number."""
-    value = _number(text)
-    if math.isinf(value):
-        raise argparse.ArgumentTypeError(f"expected a finite number, got {text!r}")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = finite(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text!r}")
-    return value
-
-
-def stops(text: str) -> float:
-    """The value of a flag that is an exposure."""
-    value = finite(text)
-    if abs(value) > 30:
-        raise argparse.ArgumentTypeError(f"expected between -30 and 30 stops, got {text!r}")
-    return value
-
-
-def _length(text: str) -> float:
-    """``50mm``, ``3.6cm``, ``2m`` or plain metres -> metres."""
-    number, unit = re.fullmatch(r"(.*?)\s*(mm|cm|m|)", text.strip(), re.DOTALL).groups()  # type: ignore[union-attr]
-    value = _number(number) * _METRES[unit]
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"expected a length above 0, such as 50mm or 2.5, got {text!r}")
-    return value
-
-
-def _pixel(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+),(\d+)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"expected a pixel X,Y such as 320,240, got {text!r}")
-    return int(match[1]), int(match[2])
-
-
-def count(text: str) -> int:
-    """The value of a flag that counts something."""
-    if not re.fullmatch(r"\d{1,4}", text) or not 1 <= int(text) <= 1024:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 to 1024, got {text!r}")
-    return int(text)
 
 
 def _aperture(text: str) -> Aperture:

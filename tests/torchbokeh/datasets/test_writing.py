@@ -1,9 +1,9 @@
-"""Shards: whole or absent, the same bytes however they were made, and the same tensors back."""
+"""Shards are whole or absent, and of the same bytes however they were made."""
 
+import importlib.util
 import io
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -15,82 +15,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader, Dataset, get_worker_info
+from torch.utils.data import Dataset
 
-import torchbokeh.datasets.shards as module
-from torchbokeh.datasets.shards import read_shards, shard_indices, write_shards
+import torchbokeh.datasets.writing
+from torchbokeh.datasets import read_shards, write_shards
 
-H, W, L = 6, 8, 2
-
-
-class Fake(Dataset):
-    """The interface of ProceduralDataset with random numbers for pictures."""
-
-    def __init__(self, seed=0, fail_at=None, seconds=0.0):
-        self.seed, self.fail_at, self.seconds = seed, fail_at, seconds
-
-    def settings(self):
-        return {"seed": self.seed, "resolution": (H, W)}
-
-    def __len__(self):
-        return 1000
-
-    def __getitem__(self, index):
-        time.sleep(self.seconds)
-        if index == self.fail_at:
-            raise KeyboardInterrupt if get_worker_info() is None else RuntimeError("broken")
-        generator = torch.Generator().manual_seed(self.seed * 1000 + index)
-
-        def rand(*shape):
-            return torch.rand(*shape, generator=generator)
-
-        depth = rand(1, H, W)
-        depth[:, 0] = torch.inf
-        return {
-            "image": rand(3, H, W),
-            "depth": depth,
-            "motion": rand(H, W, 2).permute(2, 0, 1),  # not contiguous
-            "coc": rand(1, H, W),
-            "target": rand(3, H, W),
-            "layers": rand(L, 4, H, W),
-            "layer_depth": rand(L, 1, H, W),
-            "layer_motion": rand(L, 2, H, W),
-            "lens": {"focal_length": rand(()), "f_number": rand(()), "focus_distance": torch.tensor(torch.inf)},
-            "recipe": f"räcipe {index % 3}",
-            "index": index,
-        }
-
-
-COUNT, PER_SHARD = 25, 4  # six files of four samples and one of a single one
-
-
-def write(out, dataset=None, **changes):
-    options = {"per_shard": PER_SHARD, "show_progress": False, **changes}
-    return write_shards(dataset or Fake(), out, options.pop("count", COUNT), **options)
-
-
-def content(out):
-    return {path.name: path.read_bytes() for path in sorted(out.iterdir())}
-
-
-def assert_same(sample, other):
-    assert list(sample) == list(other)
-    for key, value in other.items():
-        if key == "lens":
-            assert_same(sample[key], value)
-        elif isinstance(value, torch.Tensor):
-            assert sample[key].dtype == torch.float32
-            assert torch.equal(sample[key], value)
-        else:
-            assert sample[key] == value
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A folder written in one go."""
-    out = tmp_path_factory.mktemp("shards") / "new" / "whole"
-    assert [path.name for path in write(out)] == [f"shard-{j:06d}.tar" for j in range(7)]
-    return out
+# pytest puts no folder on the path: the helper beside this file is loaded by its place.
+spec = importlib.util.spec_from_file_location("fake_dataset", Path(__file__).with_name("_fake.py"))
+fake = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(fake)
+Fake, write, content = fake.Fake, fake.write, fake.content
+COUNT, PER_SHARD, H, W = fake.COUNT, fake.PER_SHARD, fake.H, fake.W
 
 
 def test_what_is_in_a_shard(whole):
@@ -152,7 +87,7 @@ def test_a_killed_run(whole, tmp_path, workers):
     out = tmp_path / "out"
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        f"from test_shards import Fake, write\nfrom pathlib import Path\n"
+        f"from _fake import Fake, write\nfrom pathlib import Path\n"
         f"write(Path({str(out)!r}), Fake(seconds=0.2), workers={workers})"
     )
     with subprocess.Popen([sys.executable, "-c", code], start_new_session=True) as process:
@@ -204,7 +139,7 @@ def test_a_broken_shard_is_written_again(whole, tmp_path, damage):
     path.write_bytes({**broken, "other": other, "longer": data + bytes(512)}[damage])
     with pytest.warns(RuntimeWarning, match=r"shard-000002.tar: is broken, so it is written again") as caught:
         assert write(tmp_path) == [path]
-    assert caught[0].filename == __file__
+    assert caught[0].filename == fake.__file__
     assert content(tmp_path) == content(whole)
 
 
@@ -230,7 +165,7 @@ def test_another_data_set_is_refused(whole, dataset, changes, message):
 
 
 def test_another_version_is_refused(whole, monkeypatch):
-    monkeypatch.setattr(module, "version", lambda name: "9.9")
+    monkeypatch.setattr(torchbokeh.datasets.writing, "version", lambda name: "9.9")
     with pytest.raises(ValueError, match=r'was begun with torchbokeh "[0-9.]+", not "9.9"'):
         write(whole)
 
@@ -282,127 +217,6 @@ def test_a_dataset_without_length_and_settings(tmp_path):
 
     assert len(write(tmp_path, Bare())) == 7
     assert len(list(read_shards(tmp_path))) == COUNT
-
-
-def test_shard_indices_cover_all_once():
-    for machines in (1, 2, 3, 10):
-        shares = [shard_indices(COUNT, PER_SHARD, (k + 1, machines)) for k in range(machines)]
-        assert sorted(i for share in shares for indices in share.values() for i in indices) == list(range(COUNT))
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_round_trip(whole, workers):
-    samples = list(DataLoader(read_shards(whole), batch_size=None, num_workers=workers))
-    assert sorted(sample["index"] for sample in samples) == list(range(COUNT))
-    for sample in samples:
-        assert_same(sample, Fake()[sample["index"]])
-    if not workers:
-        assert [sample["index"] for sample in samples] == list(range(COUNT))
-
-
-def test_batches(whole):
-    batch = next(iter(DataLoader(read_shards(whole), batch_size=4)))
-    assert batch["layers"].shape == (4, L, 4, H, W)
-    assert batch["lens"]["f_number"].shape == (4,)
-    assert batch["index"].tolist() == [0, 1, 2, 3]
-
-
-def test_only_some_keys(whole):
-    sample = next(iter(read_shards(whole, keys=("target", "lens", "layer_depth"))))
-    assert_same(sample, {key: Fake()[0][key] for key in ("target", "lens", "layer_depth")})
-    with pytest.raises(ValueError, match=r"keys: expected some of image, depth, .*, index, got 'mask'"):
-        read_shards(whole, keys=("image", "mask"))
-
-
-def indices(pipeline):
-    return [sample["index"] for sample in pipeline]
-
-
-def test_processes_share_the_files(whole, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    shares = []
-    for rank in "01":
-        monkeypatch.setenv("RANK", rank)
-        shares.append([int(i) for i in indices(DataLoader(read_shards(whole, shuffle=5), batch_size=None))])
-    assert sorted(chain.from_iterable(shares)) == list(range(COUNT))
-    assert min(map(len, shares)) >= 9
-    monkeypatch.setenv("WORLD_SIZE", "8")
-    with pytest.raises(ValueError, match="at least one file for each of 8 processes, got 7"):
-        next(iter(read_shards(whole)))
-
-
-def test_shuffle(whole):
-    first = indices(read_shards(whole, shuffle=10, seed=1))
-    assert sorted(first) == list(range(COUNT))
-    assert first != list(range(COUNT))
-    assert indices(read_shards(whole, shuffle=10, seed=1)) == first
-    assert indices(read_shards(whole, shuffle=10, seed=2)) != first
-    twice = indices(read_shards(whole, shuffle=10, seed=1).repeat(2))
-    assert twice[:COUNT] == first
-    assert sorted(twice[COUNT:]) == list(range(COUNT))
-    assert twice[COUNT:] != first
-
-
-def test_pipelines_can_be_sent_to_spawned_workers(whole):
-    assert len(indices(pickle.loads(pickle.dumps(read_shards(whole, shuffle=3))))) == COUNT
-
-
-def test_an_abandoned_pass_leaves_no_file_open(whole):
-    stream = iter(read_shards(whole))
-    next(stream)
-    del stream  # a ResourceWarning would be an error
-
-
-def test_sources(whole, tmp_path):
-    names = [whole / "shard-000003.tar", str(whole / "shard-000001.tar")]
-    assert indices(read_shards(names)) == [12, 13, 14, 15, 4, 5, 6, 7]
-    assert indices(read_shards(names[0])) == [12, 13, 14, 15]
-    assert indices(read_shards(str(whole / "shard-{000000..000001}.tar"))) == list(range(8))
-    with pytest.raises(ValueError, match=r"shard-000007.tar: does not exist"):
-        read_shards(str(whole / "shard-{000000..000009}.tar"))
-    with pytest.raises(ValueError, match="elsewhere: does not exist"):
-        read_shards(tmp_path / "elsewhere")
-    with pytest.raises(ValueError, match="holds no shards"):
-        read_shards(tmp_path)
-    with pytest.raises(ValueError, match="at least one file"):
-        read_shards([])
-    with pytest.raises(ValueError, match="shuffle: expected at least 0"):
-        read_shards(whole, shuffle=-1)
-
-
-def test_a_set_that_is_not_finished(tmp_path):
-    write(tmp_path, shard=(2, 3))
-    with pytest.raises(ValueError, match=r"5 of 7 shards are missing, the first is shard-000000.tar"):
-        read_shards(tmp_path)
-    assert len(indices(read_shards(tmp_path, partial=True))) == 8
-
-
-def test_a_tar_of_something_else(tmp_path):
-    path = tmp_path / "other.tar"
-    with tarfile.open(path, "w") as tar:
-        tar.addfile(tarfile.TarInfo("a.image.npy"))
-    with pytest.raises(ValueError, match=r"other.tar: sample a has no entry depth.npy; was it written by write_shards"):
-        next(iter(read_shards(path)))
-
-
-def test_webdataset_is_optional(whole, monkeypatch):
-    monkeypatch.setitem(sys.modules, "webdataset", None)
-    with pytest.raises(ImportError, match=r"pip install torchbokeh\[data\]"):
-        read_shards(whole)
-
-
-def test_procedural_dataset(tmp_path):
-    from torchbokeh.scenes import ProceduralDataset
-
-    dataset = ProceduralDataset(seed=3, resolution=(16, 24), length=3, views=4)
-    write(tmp_path / "once", dataset, count=3, per_shard=2)
-    samples = list(read_shards(tmp_path / "once"))
-    assert len(samples) == 3
-    for index, sample in enumerate(samples):
-        assert sample.keys() == dataset[index].keys()
-        assert_same(sample, {key: dataset[index][key] for key in sample})
-    write(tmp_path / "again", dataset, count=3, per_shard=2, workers=2)
-    assert content(tmp_path / "again") == content(tmp_path / "once")
 
 
 def test_a_run_that_failed_before_its_first_file_holds_nobody_back(tmp_path):

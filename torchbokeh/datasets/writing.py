@@ -1,4 +1,4 @@
-"""Data sets on disk: samples written as WebDataset shards by any number of machines, and read back as tensors."""
+"""Data sets on disk: samples written as WebDataset shards by any number of machines."""
 
 import io
 import json
@@ -9,28 +9,22 @@ import tarfile
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial as partial_of
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from torchbokeh.datasets.shard_entries import KEYS, LAYERS, MAPS, SUFFIXES, decoded, entries_of
-from torchbokeh.io.pictures import replacing
+from torchbokeh.datasets.layout import KEYS, LAYERS, MANIFEST, MAPS, entry_names, read_manifest, shard_indices
+from torchbokeh.ops.checks import check_whole
+from torchbokeh.ops.system.files import make_folder, replacing
 from torchbokeh.ops.system.processes import end_with_parent, ending_children, starting_children
-
-if TYPE_CHECKING:
-    from webdataset import DataPipeline
-
-_MANIFEST = "dataset.json"
-_MOST_FILES = 10**6  # what the six digits of their names can tell apart
 
 
 def write_shards(
@@ -88,17 +82,13 @@ def write_shards(
     from tqdm import tqdm
 
     files = shard_indices(count, per_shard, shard)
-    if workers < 0:
-        raise ValueError(f"workers: expected at least 0, got {workers}")
+    check_whole("workers", workers, 0)
     length = len(dataset) if hasattr(dataset, "__len__") else count
     if length < count:
         raise ValueError(f"count: expected at most the {length} samples of the dataset, got {count}")
     out = Path(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"{out}: cannot be made a folder ({error.strerror}); choose another") from None
-    _claim(out, dataset, count, per_shard)
+    make_folder(out)
+    _check_manifest(out, dataset, count, per_shard)
     missing = {out / name: indices for name, indices in files.items() if not _is_whole(out / name, indices)}
     for path in missing:
         if path.exists():
@@ -120,7 +110,7 @@ def write_shards(
     with bar as progress, ending_children():
         with starting_children():
             loading = iter(loader)
-        samples = _made(loading)
+        samples = _loaded(loading)
         for path, indices in missing.items():
             with _publishing(path) as file, tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
                 for _ in indices:
@@ -134,103 +124,7 @@ def write_shards(
     return list(missing)
 
 
-def shard_indices(count: int, per_shard: int = 100, shard: tuple[int, int] = (1, 1)) -> dict[str, range]:
-    """Which files one machine writes, and the samples in each.
-
-    Args:
-        count: samples in the whole data set.
-        per_shard: samples in one file.
-        shard: ``(k, m)``: machine k of m, from 1 to m. File j is that of machine ``j % m + 1``.
-
-    Returns:
-        Indices by file name, in order. Empty for a machine that has nothing to do.
-
-    Raises:
-        ValueError: an argument out of its range.
-
-    Example:
-        >>> shard_indices(250, per_shard=100, shard=(1, 2))
-        {'shard-000000.tar': range(0, 100), 'shard-000002.tar': range(200, 250)}
-    """
-    for name, value in (("count", count), ("per_shard", per_shard)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, got {value}")
-    k, m = shard
-    if not 1 <= k <= m:
-        raise ValueError(f"shard: expected (k, m) with 1 <= k <= m, got ({k}, {m})")
-    least = -(-count // _MOST_FILES)
-    if per_shard < least:
-        raise ValueError(f"per_shard: expected at least {least} for {count} samples, got {per_shard}")
-    numbers = range(k - 1, -(-count // per_shard), m)
-    return {f"shard-{j:06d}.tar": range(j * per_shard, min((j + 1) * per_shard, count)) for j in numbers}
-
-
-def read_shards(
-    source: str | Path | Sequence[str | Path],
-    *,
-    keys: Sequence[str] | str | None = None,
-    shuffle: int = 0,
-    seed: int = 0,
-    partial: bool = False,
-) -> "DataPipeline":
-    """Read what :func:`write_shards` wrote, as the same dicts of tensors, from tar files in sequence.
-
-    Files are divided among the processes of ``torch.distributed`` (or ``torchrun``) and then among the workers of a
-    ``DataLoader``, so each sample comes once per pass. Shares differ by up to one file: in distributed training
-    take a fixed number of steps of ``read_shards(...).repeat()``, or processes wait for each other at the end.
-
-    Args:
-        source: a folder, one file, a URL or pattern of WebDataset such as ``"out/shard-{000000..000009}.tar"``, or a
-            sequence of those. Only take patterns from people you trust: one that begins with ``pipe:`` is a command.
-        keys: what of each sample to decode, such as ``("image", "coc", "target")``; ``None``: all of it.
-        shuffle: samples that each worker holds to draw the next from; 0 keeps the order of writing. Above 0 the
-            files are shuffled too.
-        seed: of the shuffling. Under ``repeat()`` each pass has another order; a ``DataLoader`` with workers starts
-            anew with each epoch, so pass ``seed=epoch`` to a new ``read_shards`` for another order.
-        partial: accept a folder where files are missing.
-
-    Returns:
-        A ``webdataset.DataPipeline``, an ``IterableDataset`` of dicts as those of
-        :class:`~torchbokeh.scenes.ProceduralDataset`, which a ``DataLoader`` can put into batches.
-
-    Raises:
-        ImportError: the package webdataset is missing; it comes with the extra ``torchbokeh[data]``.
-        ValueError: nothing to read, a file that does not exist, an unknown key, or ``shuffle`` below 0; on iteration
-            also fewer files than processes, or an entry that is missing.
-
-    Example:
-        >>> loader = DataLoader(read_shards("out/set", shuffle=100), batch_size=8, num_workers=4)  # doctest: +SKIP
-        >>> next(iter(loader))["image"].shape  # doctest: +SKIP
-        torch.Size([8, 3, 256, 256])
-    """
-    try:
-        import webdataset as wds
-    except ImportError:
-        raise ImportError("reading shards needs the package webdataset; pip install torchbokeh[data]") from None
-    if shuffle < 0:
-        raise ValueError(f"shuffle: expected at least 0, got {shuffle}")
-    keys = (keys,) if isinstance(keys, str) else keys
-    unknown = {*(keys or ())} - {*KEYS}
-    if unknown:
-        raise ValueError(f"keys: expected some of {', '.join(KEYS)}, got {min(unknown)!r}")
-    each = [source] if isinstance(source, str | Path) else source
-    urls = [url for one in each for url in _expand(one, partial)]
-    if not urls:
-        raise ValueError(f"source: expected at least one file, got {source!r}")
-    return wds.DataPipeline(
-        wds.SimpleShardList(urls, seed=seed if shuffle else None),
-        _enough,
-        wds.split_by_node,
-        wds.split_by_worker,
-        wds.detshuffle(len(urls), initial=len(urls), seed=seed) if shuffle else None,
-        entries_of,
-        wds.tariterators.group_by_keys,
-        partial_of(decoded, keys=KEYS if keys is None else tuple(keys)),
-        wds.detshuffle(shuffle, initial=min(shuffle, 100), seed=seed) if shuffle else None,
-    )
-
-
-def _made(loading: Iterator[Any]) -> Iterator[list[tuple[str, bytes]]]:
+def _loaded(loading: Iterator[Any]) -> Iterator[list[tuple[str, bytes]]]:
     try:
         yield from loading
     except RuntimeError as error:
@@ -261,11 +155,7 @@ class _Encoded(Dataset[list[tuple[str, bytes]]]):
         }
         packed = _npz({name: _npy(sample[key]) for key, name in LAYERS.items()})
         data = [*(_npy(sample[name]) for name in MAPS), packed, json.dumps(meta).encode()]
-        return list(zip(_names(index), data, strict=True))
-
-
-def _names(index: int) -> list[str]:
-    return [f"{index:08d}.{suffix}" for suffix in SUFFIXES]
+        return list(zip(entry_names(index), data, strict=True))
 
 
 def _npy(values: Tensor) -> bytes:
@@ -286,43 +176,28 @@ def _npz(arrays: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _claim(out: Path, dataset: Dataset[dict[str, Any]], count: int, per_shard: int) -> None:
+def _check_manifest(out: Path, dataset: Dataset[dict[str, Any]], count: int, per_shard: int) -> None:
     """Write the manifest, or hold the one that is there against this call."""
     settings: dict[str, Any] = getattr(dataset, "settings", dict)()
     wanted = {"torchbokeh": version("torchbokeh"), "count": count, "per_shard": per_shard, "settings": settings}
     text = json.dumps(wanted, indent=2) + "\n"
-    path = out / _MANIFEST
+    path = out / MANIFEST
     # In this order: another machine that has just begun writes its manifest before its first file.
     has_shards = any(out.glob("shard-*.tar"))
-    if not path.exists():
-        if has_shards:
-            raise ValueError(f"{out}: holds shards, but no {_MANIFEST} that says of what; choose another folder")
-        with replacing(path) as temporary:  # machines that begin together write the same
-            temporary.write_text(text, encoding="utf-8")
-        return
-    found, wanted = _read_manifest(path), json.loads(text)
-    before, now = ({**manifest, **manifest["settings"]} for manifest in (found, wanted))
-    differing = [name for name in {**before, **now} if name != "settings" and before.get(name) != now.get(name)]
-    if differing and not has_shards and not any(out.glob(".shard-*.tmp")):
-        with replacing(path) as temporary:  # a run that failed before its first file holds nobody back
-            temporary.write_text(text, encoding="utf-8")
-    elif differing:
-        what = ", ".join(
-            f"{name} {json.dumps(before.get(name))}, not {json.dumps(now.get(name))}" for name in differing
-        )
-        raise ValueError(f"{out}: was begun with {what}; go on with the same settings or choose another folder")
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        settings, *numbers = (manifest[name] for name in ("settings", "count", "per_shard"))
-        if not isinstance(settings, dict) or not all(type(n) is int for n in numbers):
-            raise ValueError
-        shard_indices(*numbers)
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise ValueError(f"{path}: is not the manifest of a data set; choose another folder") from None
-    return manifest
+    if path.exists():
+        found, wanted = read_manifest(path), json.loads(text)
+        before, now = ({**manifest, **manifest["settings"]} for manifest in (found, wanted))
+        differing = [name for name in {**before, **now} if name != "settings" and before.get(name) != now.get(name)]
+        if not differing:
+            return
+        if has_shards or any(out.glob(".shard-*.tmp")):  # a run that failed before its first file holds nobody back
+            pairs = (f"{name} {json.dumps(before.get(name))}, not {json.dumps(now.get(name))}" for name in differing)
+            what = ", ".join(pairs)
+            raise ValueError(f"{out}: was begun with {what}; go on with the same settings or choose another folder")
+    elif has_shards:
+        raise ValueError(f"{out}: holds shards, but no {MANIFEST} that says of what; choose another folder")
+    with replacing(path) as temporary:  # machines that begin together write the same
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _is_whole(path: Path, indices: range) -> bool:
@@ -332,7 +207,7 @@ def _is_whole(path: Path, indices: range) -> bool:
             entries = tar.getmembers()
     except (FileNotFoundError, tarfile.TarError):
         return False
-    if [entry.name for entry in entries] != [name for index in indices for name in _names(index)]:
+    if [entry.name for entry in entries] != [name for index in indices for name in entry_names(index)]:
         return False
     last = entries[-1]
     blocks = math.ceil(last.size / tarfile.BLOCKSIZE) + 2  # an archive ends with two empty blocks
@@ -377,38 +252,3 @@ def _remove_stale(out: Path, done: list[Path]) -> defaultdict[Path, list[Path]]:
         for temporary in found.pop(path, []):
             temporary.unlink(missing_ok=True)
     return found
-
-
-def _expand(source: str | Path, partial: bool) -> list[str]:
-    """The files in a folder, or those that a pattern means; local ones exist."""
-    from webdataset.shardlists import expand_urls
-
-    if not Path(source).is_dir():
-        urls: list[str] = [str(source)] if isinstance(source, Path) else expand_urls(source)
-        for url in urls:
-            if ":" not in url and not Path(url).is_file():
-                raise ValueError(f"{url}: does not exist; check the name")
-        return urls
-    folder = Path(source)
-    paths = sorted(folder.glob("shard-*.tar"))
-    if (folder / _MANIFEST).exists() and not partial:
-        manifest = _read_manifest(folder / _MANIFEST)
-        expected = shard_indices(manifest["count"], manifest["per_shard"])
-        missing = expected.keys() - {path.name for path in paths}
-        if missing:
-            what = f"{len(missing)} of {len(expected)} shards are missing, the first is {min(missing)}"
-            raise ValueError(f"{folder}: {what}; write them, or pass partial=True")
-    if not paths:
-        raise ValueError(f"{folder}: holds no shards; write some with write_shards")
-    return [str(path) for path in paths]
-
-
-def _enough(shards: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Refuse fewer shards than processes: one of them would have nothing, and the others would wait for it."""
-    from webdataset.utils import pytorch_worker_info
-
-    shards, processes = list(shards), pytorch_worker_info()[1]
-    if len(shards) < processes:
-        want = f"expected at least one file for each of {processes} processes"
-        raise ValueError(f"source: {want}, got {len(shards)}; write them with a smaller per_shard")
-    yield from shards
