@@ -20,7 +20,7 @@ from torchbokeh.ops.system.files import replacing
 from torchbokeh.plan.plan import Plan, SplattingPlan
 from torchbokeh.renderers.kernel_splatting import KernelSplatting
 from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.planned import Planned, fitting
+from torchbokeh.renderers.planned import AnyPlan, Planned, fitting
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -133,7 +133,7 @@ def _renderer(module: LensBlur | KernelSplatting, inputs: tuple[Tensor, ...], pl
     lens, margin = (module.lens, module.margin) if isinstance(module, LensBlur) else (None, 0)
     name = "coc" if lens is None else "depth"
     request = module.request(inputs[0], **{name: inputs[1]})
-    found: Plan | SplattingPlan = module.decide(request)
+    found: AnyPlan = module.decide(request)
     if plan is not None:
         found = fitting(plan, type(found), request)
     if found.sharp or found.uniform is not None:

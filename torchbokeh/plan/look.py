@@ -79,12 +79,12 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     if image.numel() == 0:
         raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
     size, background = (image.shape[-2], image.shape[-1]), request.background is not None
-    moved = _look_at_motion(image, request.motion)
+    motion, pan, approach = _look_at_motion(image, request.motion)
     if not request.layered:
         clamped = coc.new_zeros(()) if request.clamped is None else request.clamped.to(coc.dtype).mean()
         found = [*coc.aminmax(), clamped, *merged_shares(coc, settings.quality, settings.tolerance)]
         low, high, share, *shares = torch.stack(found).tolist()
-        return Look(size, (low,), (high,), share, tuple(shares), 0, (), (), background, *moved)
+        return Look(size, (low,), (high,), share, tuple(shares), 0, (), (), background, motion, pan, approach)
     there = image[:, :, 3:] > 0
     lows = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1)
     highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
@@ -98,7 +98,7 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
     opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
     ends = tuple(bounds[k] for k in kept), tuple(bounds[count + k] for k in kept)
-    return Look(size, *ends, share, tuple(shares), count, kept, opaque, background, *moved)
+    return Look(size, *ends, share, tuple(shares), count, kept, opaque, background, motion, pan, approach)
 
 
 def _look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, float] | None, float]:

@@ -153,8 +153,8 @@ class AccumulationBuffer(nn.Module):
         request = Request.of(Optics(self.lens), source, depth, coc=coc, motion=motion)
         layers, radii, moved, *_ = request.working()
         views = self._spread(self.lens, request.sensor.size)
-        moved = moved.displacements[0] if moved else None
-        return request.answered(accumulate_layers(layers, radii, moved, *views, settings))
+        displacement = moved.displacements[0] if moved else None
+        return request.answered(accumulate_layers(layers, radii, displacement, *views, settings))
 
     def _spread(self, lens: Lens | None, size: tuple[int, int]) -> tuple[Views, Prism | None]:
         """The views, and what a lens does to their wavelengths where these are told apart."""

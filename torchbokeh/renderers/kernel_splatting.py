@@ -196,6 +196,6 @@ class KernelSplatting(nn.Module):
                 return blur_uniform(image, plan.uniform, profile)
             return blur_one_layer(image, coc, profile, plan.detail)
 
-    def planned(self, plan: SplattingPlan) -> Planned[SplattingPlan]:
+    def planned(self, plan: SplattingPlan) -> Planned:
         """The same renderer with its plan fixed, for `torch.export` and the like."""
         return Planned(self, plan)

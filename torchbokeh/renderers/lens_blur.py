@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torchbokeh.compose.colours import Mixture, in_light
 from torchbokeh.compose.routes import ROUTES, Pieces
 from torchbokeh.lens.base import Lens
-from torchbokeh.ops.checks import check_choice, check_number, check_whole
+from torchbokeh.ops.checks import check_choice, check_whole, is_number, is_whole
 from torchbokeh.ops.spans import subdivide
 from torchbokeh.picture.motion import ADVANCE, Displacements
 from torchbokeh.picture.request import Background, Optics, Request
@@ -94,7 +94,9 @@ class LensBlur(nn.Module):
         if lens is not None and not isinstance(lens, Lens):
             raise TypeError(f"lens: expected a Lens, got {type(lens).__name__}")
         check_quality(quality, tolerance)
-        if max_coc is not None and not check_number("max_coc", max_coc) > 0:
+        if max_coc is not None and not is_number(max_coc):
+            raise TypeError(f"max_coc: expected a number or None, got {max_coc!r}")
+        if max_coc is not None and not max_coc > 0:
             raise ValueError(f"max_coc: expected a radius in px above 0, got {max_coc}")
         check_choice("shutter", shutter, ADVANCE)
         self.lens = lens
@@ -129,8 +131,9 @@ class LensBlur(nn.Module):
 
         Two small copies from the device, which a forward pass with ``plan=`` saves.
         """
-        maps = {"coc": coc, "motion": motion, "shutter_depth": shutter_depth}
-        return self.decide(self.request(image, depth, **maps, background=background))
+        return self.decide(
+            self.request(image, depth, coc=coc, motion=motion, shutter_depth=shutter_depth, background=background)
+        )
 
     def forward(
         self,
@@ -187,9 +190,15 @@ class LensBlur(nn.Module):
         background: Background = None,
     ) -> Request:
         """Check what `forward` is called with, and turn depth into circles of confusion."""
-        optics = self._optics()
-        maps = {"coc": coc, "motion": motion, "shutter_depth": shutter_depth}
-        request = Request.of(optics, image, depth, **maps, background=background)
+        request = Request.of(
+            self._optics(),
+            image,
+            depth,
+            coc=coc,
+            motion=motion,
+            shutter_depth=shutter_depth,
+            background=background,
+        )
         if request.motion and not isinstance(self.aperture, Disc):
             raise ValueError(f"motion: expected None with an aperture that is not a disc, {self.aperture}")
         return request
@@ -225,7 +234,7 @@ class LensBlur(nn.Module):
                 mixture.add(part, colour, picture.share, layered=request.layered)
             return mixture.total()
 
-    def planned(self, plan: Plan) -> Planned[Plan]:
+    def planned(self, plan: Plan) -> Planned:
         """The same renderer with its plan fixed, for `torch.export` and the like."""
         return Planned(self, plan)
 
@@ -237,6 +246,6 @@ def _count(name: str, value: int | str, most: int) -> int | None:
     """A positive number, or ``None`` for ``"auto"``."""
     if isinstance(value, str) and value == "auto":
         return None
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not is_whole(value):
         raise TypeError(f"{name}: expected an int or 'auto', got {value!r}")
     return check_whole(name, value, 1, most)

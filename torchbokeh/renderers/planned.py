@@ -1,6 +1,6 @@
 """A renderer whose plan is fixed: for compilers and exporters, which see one graph of it."""
 
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from torch import Tensor, nn
 
@@ -8,25 +8,27 @@ from torchbokeh.compose.routes import Pieces
 from torchbokeh.picture.request import Request
 from torchbokeh.plan.plan import Plan, SplattingPlan
 
-P = TypeVar("P", Plan, SplattingPlan)
+AnyPlan = Plan | SplattingPlan
+
+P = TypeVar("P", bound=AnyPlan)
 
 
-class PlannedRenderer(Protocol[P]):
+class PlannedRenderer(Protocol):
     """A renderer that checks a request, decides once what it needs, and paints the picture by that plan."""
 
     def request(self, *inputs: Any, **maps: Any) -> Request:
         """Check inputs, and turn depth into circles of confusion."""
         ...
 
-    def decide(self, request: Request) -> P:
-        """What a request needs."""
+    def decide(self, request: Request) -> Any:
+        """The plan: what a request needs."""
         ...
 
-    def pieces(self, plan: P) -> Pieces:
+    def pieces(self, plan: Any) -> Pieces:
         """The shapes of the aperture that a plan splats with."""
         ...
 
-    def paint(self, request: Request, plan: P, pieces: Pieces | None = None) -> Tensor:
+    def paint(self, request: Request, plan: Any, pieces: Pieces | None = None) -> Tensor:
         """The picture of a request, with its margin, in at least float32."""
         ...
 
@@ -44,7 +46,7 @@ def fitting(plan: object, kind: type[P], request: Request) -> P:
     return plan
 
 
-class Planned(nn.Module, Generic[P]):
+class Planned(nn.Module):
     """A renderer that carries out one plan, without a look at its inputs or at the shape of its aperture.
 
     It is made by `torchbokeh.LensBlur.planned` and `torchbokeh.KernelSplatting.planned`. Whoever passes inputs unlike
@@ -55,7 +57,7 @@ class Planned(nn.Module, Generic[P]):
         plan: what to do.
     """
 
-    def __init__(self, renderer: PlannedRenderer[P], plan: P) -> None:
+    def __init__(self, renderer: PlannedRenderer, plan: AnyPlan) -> None:
         super().__init__()
         self.renderer, self.plan = renderer, plan
         # Shapes of apertures are made by sorting and searching; they are constants here.

@@ -170,7 +170,7 @@ def test_blue_lies_farther_out_than_red(lateral_map: FieldMap | None, depth: flo
 
 
 class Doubling(Lens):
-    def coc(self, depth: Tensor, width: int) -> Tensor:
+    def coc(self, depth: Tensor, width: int, *, field: Field | None = None) -> Tensor:
         return 2 * depth
 
     def depth(self, coc: Tensor, width: int) -> Tensor:

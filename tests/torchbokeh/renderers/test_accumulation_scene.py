@@ -250,7 +250,7 @@ def test_reuse(monkeypatch: pytest.MonkeyPatch) -> None:
         parents.append(shared_views(*args))
         return parents[-1]
 
-    monkeypatch.setattr(module, "shared_views", spy)
+    monkeypatch.setattr(setup, "shared_views", spy)
     sharp = Sprite(texture(4, 48, 64, 0, 1.0), (0.0, 0.0, 2.0), (1.2, 0.9))
     scene = Scene((*cards()[2:], sharp), WALL)
     look = camera(1.4, 2.0)

@@ -419,7 +419,7 @@ def test_a_margin_is_known_and_cut_off(quality: str, layered: bool) -> None:
 
 def test_what_a_margin_may_be() -> None:
     image = torch.rand(1, 3, 10, 12)
-    with pytest.raises(ValueError, match="margin: expected at least 1, got -1"):
+    with pytest.raises(ValueError, match="margin: expected at least 0, got -1"):
         LensBlur(margin=-1)
     with pytest.raises(TypeError, match=r"margin: expected an int, got 1\.5"):
         LensBlur(margin=1.5)  # type: ignore[arg-type]
