@@ -14,9 +14,9 @@ import torchbokeh
 from torchbokeh.ops.sampling import halton
 from torchbokeh.ops.spectrum import spectral_samples
 from torchbokeh.report.measure import Work, errors, measure
-from torchbokeh.report.scenes import still
+from torchbokeh.report.rows import Row, Say
+from torchbokeh.report.scenes import still, with_dispersion
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
 from torchbokeh.scenes import Camera, Scene
 
 SPECTRA = ("rgb", "continuous")
@@ -36,7 +36,7 @@ PEAK, WIDTH, SAMPLES = 480.0, 20.0, 64
 def dispersing(camera: Camera, spectrum: str, axial: float, lateral: float) -> Camera:
     """The same camera with a lens of BK7 that disperses."""
     dispersion = torchbokeh.Dispersion("BK7", axial, lateral, spectrum=spectrum)  # type: ignore[arg-type]
-    return replace(camera, lens=torchbokeh.ThinLens(**camera.lens._values(), dispersion=dispersion))
+    return with_dispersion(camera, dispersion)
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,8 @@ def chromatic_truth(settings: Settings, say: Say) -> list[Row]:
 
     The truth is the mean of two halves, each ``ChromaticAccumulation`` with a seed of its own; few views take a third.
     The row with the method ``truth`` compares the halves. Of a continuous spectrum only the last strengths are taken.
-    Errors leave out a
-    border as wide as the largest radius, the spread of colours and 2 px. ``times_equal``, of LensBlur, says how many
-    times longer the accumulation takes to come as near by SSIM; see `times_equal`.
+    Errors leave out a border as wide as the largest radius, the spread of colours and 2 px. ``times_equal``, of
+    LensBlur, says how many times longer the accumulation takes to come as near by SSIM; see `times_equal`.
     """
     rows: list[Row] = []
     for work in _Case.of(replace(settings, chromatic_size=48), "coins", "rgb", (0.5, 0.03)).works((3,)).values():

@@ -1,7 +1,7 @@
 """Renderers with the options that a user may set, one of each: for the stability report."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import Any
 
@@ -9,13 +9,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.lens import ThinLens
-from torchbokeh.lens.dispersion import Dispersion
-from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.renderers.chromatic import ChromaticAccumulation
-from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.report.stability.oracles import composed, viewed
-from torchbokeh.report.stability.renderer import VIEWS, Renderer, layers_of
+from torchbokeh import AccumulationBuffer, ChromaticAccumulation, Dispersion, LensBlur, ThinLens
+from torchbokeh.report.stability.oracles import viewed
+from torchbokeh.report.stability.renderer import (
+    VIEWS,
+    Renderer,
+    ask,
+    layered,
+    layered_moving,
+    layers_of,
+    of_blur,
+    picture,
+)
 
 CUT_TO = 6.0
 """``max_coc`` of the renderer that has one, in px."""
@@ -38,28 +43,20 @@ def options() -> Iterator[Renderer]:
             run, plan = partial(_coloured, spectrum, quality), partial(_coloured_plan, spectrum, quality)
             name = f"LensBlur dispersion {spectrum}, {quality}"
             yield Renderer(name, "colours", run, run, plan, widths=dispersed, quality=quality)
-        bank: dict[str, Any] = {"moves": True, "quality": quality, "bank": "combined"}
+        bank: dict[str, Any] = {"moves": True, "bank": "combined"}
         blur = LensBlur(quality=quality)
-        run, plan, sums = (partial(_approaching, call) for call in (blur, blur.plan, partial(composed, blur)))
-        yield Renderer(f"LensBlur approaching, {quality}", "bank", run, run, plan, widths=_doubled, sums=sums, **bank)
+        yield of_blur(f"LensBlur approaching, {quality}", "bank", blur, _approaching, widths=_doubled, **bank)
         blur = LensBlur(quality=quality, shutter="start")
-        run, plan, sums = (partial(_curved, call) for call in (blur, blur.plan, partial(composed, blur)))
-        yield Renderer(f"LensBlur curved motion, {quality}", "bank", run, run, plan, ahead=1.25, sums=sums, **bank)
-    blur = LensBlur(aperture="6-gon")
-    run, plan, sums = (partial(_image, call) for call in (blur, blur.plan, partial(composed, blur)))
-    yield Renderer("LensBlur 6-gon, exact", "composed", run, sums, plan)
-    blur = LensBlur()
-    run, plan, sums = (partial(_background, call) for call in (blur, blur.plan, partial(composed, blur)))
-    yield Renderer("LensBlur background, exact", "composed", run, sums, plan)
+        yield of_blur(f"LensBlur curved motion, {quality}", "bank", blur, _curved, ahead=1.25, **bank)
+    yield of_blur("LensBlur 6-gon, exact", "composed", LensBlur(aperture="6-gon"), picture)
+    yield of_blur("LensBlur background, exact", "composed", LensBlur(), _background)
     blur = LensBlur(margin=MARGIN, max_coc=CUT_TO, quality="balanced")
-    run, plan, sums = (partial(_margin, call) for call in (blur, blur.plan, partial(composed, blur)))
-    name = "LensBlur margin and max_coc, balanced"
-    yield Renderer(name, "composed", run, run, plan, widths=_cut, quality="balanced", sums=sums)
-    run = partial(_views, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1))
+    yield of_blur("LensBlur margin and max_coc, balanced", "composed", blur, _margin, widths=_cut)
+    run = partial(ask, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1), layered)
     yield Renderer("AccumulationBuffer layers, coarser and shared", "views", run, run, texels=TEXELS)
-    run = partial(_views, AccumulationBuffer(views=VIEWS, subsamples=4))
+    run = partial(ask, AccumulationBuffer(views=VIEWS, subsamples=4), layered)
     yield Renderer("AccumulationBuffer layers, sub-samples", "rays", run, run)
-    run = partial(_moving_views, AccumulationBuffer(views=VIEWS))
+    run = partial(ask, AccumulationBuffer(views=VIEWS), layered_moving)
     yield Renderer("AccumulationBuffer layers, in motion", "views", run, _moving_viewed, moves=True)
     for spectrum in ("rgb", "continuous"):
         run = partial(_chromatic_views, spectrum)
@@ -79,10 +76,6 @@ def dispersed(coc: Tensor) -> tuple[Tensor, Tensor]:
     return sign * (coc.abs() - SPREAD).clamp_min(0), sign * (coc.abs() + SPREAD)
 
 
-def _image(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc)
-
-
 def _coloured(spectrum: str, quality: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
     out: Tensor = LensBlur(dispersing(image.shape[3], spectrum), quality=quality)(image, coc=coc)
     return out
@@ -92,48 +85,35 @@ def _coloured_plan(spectrum: str, quality: str, image: Tensor, coc: Tensor, moti
     return LensBlur(dispersing(image.shape[3], spectrum), quality=quality).plan(image, coc=coc)
 
 
-def _approaching(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc, motion=motion, shutter_depth=torch.cat([coc / 2, 2 * coc], 1))
+def _approaching(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+    return {"": image, "coc": coc, "motion": motion, "shutter_depth": torch.cat([coc / 2, 2 * coc], 1)}
 
 
 def _doubled(coc: Tensor) -> tuple[Tensor, Tensor]:
     return coc / 2, 2 * coc
 
 
-def _curved(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
+def _curved(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
     """Half of the motion, as much to its right, and a quarter of it back."""
     assert motion is not None
     right = torch.stack([-motion[:, 1], motion[:, 0]], 1)
-    return call(image, coc=coc, motion=(motion / 2, right / 2, -motion / 4))
+    return {"": image, "coc": coc, "motion": (motion / 2, right / 2, -motion / 4)}
 
 
-def _background(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc, background=(image.flip(-1), coc.abs()))
+def _background(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+    return {"": image, "coc": coc, "background": (image.flip(-1), coc.abs())}
 
 
-def _margin(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
+def _margin(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
     """The picture goes on beyond the sensor, with its last pixels."""
     if image.numel():
         image, coc = (F.pad(t, (MARGIN,) * 4, mode="replicate") for t in (image, coc))
-    return call(image, coc=coc)
+    return {"": image, "coc": coc}
 
 
 def _cut(coc: Tensor) -> tuple[Tensor, Tensor]:
     cut = coc.clamp(-CUT_TO, CUT_TO)
     return cut, cut
-
-
-def _views(buffer: AccumulationBuffer, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    rgba, radius = layers_of(image, coc)
-    out: Tensor = buffer(rgba, coc=radius)
-    return out
-
-
-def _moving_views(buffer: AccumulationBuffer, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    assert motion is not None
-    rgba, radius = layers_of(image, coc)
-    out: Tensor = buffer(rgba, coc=radius, motion=torch.stack([motion, -motion], 1))
-    return out
 
 
 def _moving_viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
@@ -142,4 +122,6 @@ def _moving_viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
 
 
 def _chromatic_views(spectrum: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    return _views(ChromaticAccumulation(dispersing(image.shape[3], spectrum), views=VIEWS), image, coc, motion)
+    buffer = ChromaticAccumulation(dispersing(image.shape[3], spectrum), views=VIEWS)
+    out: Tensor = ask(buffer, layered, image, coc, motion)
+    return out

@@ -15,23 +15,28 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.banks.splat import bank_of_motion
-from torchbokeh.compose.surfaces import CERTAIN, COARSE, FOREGROUND, bin_centres
+from torchbokeh import LensBlur, Plan, PsfBank
 from torchbokeh.ops.composite import TINY, pull_push
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.spans import Profile, area, subdivide
 from torchbokeh.ops.surface import BLEND
-from torchbokeh.picture.motion import ADVANCE, Motion, ways
-from torchbokeh.plan.plan import Plan
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import turned_capsule
 from torchbokeh.psfs.model import Labels
-from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.reconstruction import KNOWN
+from torchbokeh.report.internals import (
+    ADVANCE,
+    CERTAIN,
+    COARSE,
+    FOREGROUND,
+    KNOWN,
+    STEPS_OF_VIEWS,
+    Motion,
+    Views,
+    bank_of_motion,
+    bin_centres,
+    ways,
+)
 from torchbokeh.report.stability.splats import dense_bank
-from torchbokeh.views.layers import STEPS
-from torchbokeh.views.points import Views
 
 
 class Part(NamedTuple):
@@ -267,7 +272,7 @@ def viewed(layers: Tensor, coc: Tensor, views: int, motion: Tensor | None = None
         for k, field in zip(held, parallax, strict=True):
             # A view moves a point by its CoC times the point of the lens: which one comes to lie on each pixel?
             found = field
-            for _ in range(STEPS):
+            for _ in range(STEPS_OF_VIEWS):
                 column = x - found[:, 0] * u - found[:, 1] * time
                 row = y - found[:, 0] * v - found[:, 2] * time
                 found = _looked_up(field, row, column)

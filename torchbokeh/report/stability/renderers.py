@@ -5,49 +5,51 @@ Where a renderer does what its definition says but for rounding, the oracle is t
 two: itself in double, for rounding, and the definition, for the approximation.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchbokeh import AccumulationBuffer, KernelSplatting, LensBlur, Samples, reconstruct
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.plan.quality import QUALITIES
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.renderers.kernel_splatting import KernelSplatting
-from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.reconstruction import Samples, pixel_positions, reconstruct
+from torchbokeh.report.internals import QUALITIES, pixel_positions
 from torchbokeh.report.stability.options import options
-from torchbokeh.report.stability.oracles import composed, gathered, splatted, viewed
-from torchbokeh.report.stability.renderer import VIEWS, Renderer, bank_of, layers_of
+from torchbokeh.report.stability.oracles import gathered, splatted, viewed
+from torchbokeh.report.stability.renderer import (
+    VIEWS,
+    Renderer,
+    ask,
+    bank_of,
+    layered,
+    layers_of,
+    moving,
+    of_blur,
+    of_splatting,
+    picture,
+)
 
 
 def renderers() -> Iterator[Renderer]:
     """All of them."""
     for quality in QUALITIES:
-        splatting = KernelSplatting(quality=quality.name)
-        run, plan = partial(_still, splatting), partial(_still, splatting.plan)
-        kind, oracle, sums = ("splat", dense, None) if quality.merging is None else ("merged", run, dense)
-        yield Renderer(f"KernelSplatting, {quality.name}", kind, run, oracle, plan, quality=quality.name, sums=sums)
+        kind = "splat" if quality.merging is None else "merged"
+        name = f"KernelSplatting, {quality.name}"
+        yield of_splatting(name, kind, KernelSplatting(quality=quality.name), dense)
     for quality in QUALITIES:
-        blur, name = LensBlur(quality=quality.name), quality.name
-        for what, call, kind in (("image", _image, "composed"), ("layers", _layered, "layers")):
-            run, plan, slow = partial(call, blur), partial(call, blur.plan), partial(call, partial(composed, blur))
-            oracle, sums = (slow, None) if quality.merging is None else (run, slow)
-            yield Renderer(f"LensBlur {what}, {name}", kind, run, oracle, plan, quality=name, sums=sums)
-        run, plan, sums = partial(_moving, blur), partial(_moving, blur.plan), partial(_moving, partial(composed, blur))
-        more: dict[str, Any] = {"moves": True, "quality": name, "bank": "combined", "sums": sums}
-        yield Renderer(f"LensBlur motion, {name}", "bank", run, run, plan, **more)
+        blur = LensBlur(quality=quality.name)
+        yield of_blur(f"LensBlur image, {quality.name}", "composed", blur, picture)
+        yield of_blur(f"LensBlur layers, {quality.name}", "layers", blur, layered)
+        yield of_blur(f"LensBlur motion, {quality.name}", "bank", blur, moving, moves=True, bank="combined")
     for name in ("stylized", "physical-lens"):
-        splatting = KernelSplatting(quality="exact", bank=bank_of(name))
-        run, plan, sums = partial(_still, splatting), partial(_still, splatting.plan), partial(_banked, bank_of(name))
-        yield Renderer(f"KernelSplatting, bank {name}", "bank", run, run, plan, bank=name, sums=sums)
-    yield Renderer("AccumulationBuffer layers", "views", _views, _viewed)
+        bank = bank_of(name)
+        splatting, slow = KernelSplatting(quality="exact", bank=bank), lambda i, c, _, bank=bank: splatted(bank, i, c)
+        yield of_splatting(f"KernelSplatting, bank {name}", "bank", splatting, slow, bank=name)
+    run = partial(ask, AccumulationBuffer(views=VIEWS), layered)
+    yield Renderer("AccumulationBuffer layers", "views", run, lambda i, c, _: viewed(*layers_of(i, c), VIEWS))
     yield from options()
     yield Renderer("reconstruct", "samples", _samples, _samples, moves=True, bank="combined", sums=gathered)
 
@@ -61,36 +63,6 @@ def dense(image: Tensor, coc: Tensor, motion: Tensor | None = None) -> Tensor:
 def coverage(coc: Tensor) -> Tensor:
     """What all discs together cover of each pixel, ``(B, 1, H, W)`` float64."""
     return dense_spans(torch.ones_like(coc), coc, Disc().profile())
-
-
-def _still(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc)
-
-
-def _image(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc)
-
-
-def _moving(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc, motion=motion)
-
-
-def _layered(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    rgba, radius = layers_of(image, coc)
-    return call(rgba, coc=radius)
-
-
-def _views(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    rgba, radius = layers_of(image, coc)
-    return AccumulationBuffer(views=VIEWS)(rgba, coc=radius)
-
-
-def _viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    return viewed(*layers_of(image, coc), VIEWS)
-
-
-def _banked(bank: PsfBank, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    return splatted(bank, image, coc)
 
 
 def _samples(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:

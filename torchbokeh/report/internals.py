@@ -1,0 +1,25 @@
+# ruff: noqa: F401
+"""What the report takes of the inside of the package, in one place: all else it knows by its public names.
+
+A renamed or moved part of the package is renamed here, and where ``report`` says so.
+"""
+
+from torchbokeh.banks import highlights as bank_highlights
+from torchbokeh.banks import samples as bank_samples
+from torchbokeh.banks import splat as bank_splatting
+from torchbokeh.banks.highlights import BRIGHT, share_of_others, usual
+from torchbokeh.banks.highlights import _area as area_of_labels
+from torchbokeh.banks.splat import _confined as confined
+from torchbokeh.banks.splat import _far_beyond as far_beyond
+from torchbokeh.banks.splat import bank_of_motion, splat_bank
+from torchbokeh.compose.surfaces import CERTAIN, COARSE, FOREGROUND, bin_centres
+from torchbokeh.learn.export import OPSET
+from torchbokeh.lens.dispersion import FEWEST, SEEN, Spectrum
+from torchbokeh.picture.coc import WIDEST
+from torchbokeh.picture.motion import ADVANCE, Motion, ways
+from torchbokeh.plan.quality import QUALITIES
+from torchbokeh.renderers.reconstruction import KNOWN, pixel_positions
+from torchbokeh.views.layers import STEPS as STEPS_OF_VIEWS
+from torchbokeh.views.points import Views
+
+QUALITY_NAMES = tuple(quality.name for quality in QUALITIES)
