@@ -10,10 +10,9 @@ from torchbokeh.report.stability import checks
 from torchbokeh.report.stability.bounds import PRECISIONS
 from torchbokeh.report.stability.cases import Case, beyond, cases, even
 from torchbokeh.report.stability.mechanisms import mechanism_rows
-from torchbokeh.report.stability.options import options
 from torchbokeh.report.stability.pictures import render_rows, rows_of
 from torchbokeh.report.stability.renderer import Renderer
-from torchbokeh.report.stability.renderers import renderers
+from torchbokeh.report.stability.renderers import options, renderers
 from torchbokeh.report.stability.rows import row
 from torchbokeh.report.stability.scenes import scene_rows
 from torchbokeh.report.stability.sweeps import plan_rows, sweep_rows

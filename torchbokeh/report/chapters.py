@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from torchbokeh.report import plots, run, tables
 from torchbokeh.report.experiment import Figures
 from torchbokeh.report.psfs import chapter as psfs
-from torchbokeh.report.rows import Say
 from torchbokeh.report.settings import Settings, Sizes
 from torchbokeh.report.stability import chapter as stability
 from torchbokeh.report.stability import tables as stability_tables
@@ -27,7 +26,7 @@ class Chapter(NamedTuple):
 
     name: str
     settings: type[Sizes]
-    run: Callable[[Any, Say], dict[str, Any]]
+    run: Callable[..., dict[str, Any]]
     markdown: Callable[[dict[str, Any], Sequence[str]], str]
     draw: Callable[[dict[str, Any]], Figures]
 

@@ -1,7 +1,11 @@
 """The experiments of ``torchbokeh report``: nothing else names them. A new one is a file, and a line here."""
 
-from torchbokeh.report.chromatic.tables import BANDS, IMPORTANCE, SAMPLES
-from torchbokeh.report.chromatic.tables import TRUTH as CHROMATIC_TRUTH
+from torchbokeh.report.chromatic.experiments import (
+    DISPERSION_BANDS,
+    DISPERSION_IMPORTANCE,
+    DISPERSION_TRUTH,
+    DISPERSION_VIEWS,
+)
 from torchbokeh.report.experiment import Experiment
 from torchbokeh.report.motion.experiments import LIKE_LKS, MOTION
 from torchbokeh.report.speed.blur import LAYERS, LEFT_OUT, TRUTH
@@ -22,10 +26,10 @@ EXPERIMENTS: list[Experiment] = [
     EXPORT,
     MOTION,
     LIKE_LKS,
-    CHROMATIC_TRUTH,
-    SAMPLES,
-    BANDS,
-    IMPORTANCE,
+    DISPERSION_TRUTH,
+    DISPERSION_VIEWS,
+    DISPERSION_BANDS,
+    DISPERSION_IMPORTANCE,
     LEFT_OUT,
     STAGES,
 ]

@@ -9,33 +9,13 @@ from torchbokeh.report.experiment import Experiment, Figures, draw_figures, find
 from torchbokeh.report.machine import machine
 from torchbokeh.report.psfs import plots as drawn
 from torchbokeh.report.psfs import tables
-from torchbokeh.report.psfs.analysis import PsfSettings, equal_sparsity, large, needed, random_psfs, sizes, steps
+from torchbokeh.report.psfs.analysis import Array, PsfSettings, equal_sparsity, large, needed, random_psfs, sizes, steps
 from torchbokeh.report.psfs.splats import far_field, many, random_samples, rotation, sample_count
 from torchbokeh.report.rows import Row, Say
 
 
-def _equal(settings: PsfSettings, say: Say) -> list[Row]:
-    return equal_sparsity(random_psfs(settings.psfs, settings.support), say)
-
-
-def _needed(settings: PsfSettings, say: Say) -> list[Row]:
-    return needed(random_psfs(settings.psfs, settings.support), say)
-
-
-def _samples(settings: PsfSettings, say: Say) -> list[Row]:
-    return sample_count(settings.coordinates, settings.cells, say)
-
-
-def _ablation(settings: PsfSettings, say: Say) -> list[Row]:
-    return steps(random_psfs(settings.psfs, settings.support)[: settings.ablated], say)
-
-
-def _far(settings: PsfSettings, say: Say) -> list[Row]:
-    return far_field(settings.far, say)
-
-
-def _rotation(settings: PsfSettings, say: Say) -> list[Row]:
-    return rotation(settings.turned, settings.angles, settings.reach, say)
+def _psfs(settings: PsfSettings) -> Sequence[Array]:
+    return random_psfs(settings.psfs, settings.support)
 
 
 def _sum(settings: PsfSettings, say: Say) -> list[Row]:
@@ -45,14 +25,14 @@ def _sum(settings: PsfSettings, say: Say) -> list[Row]:
 
 
 EXPERIMENTS = [
-    Experiment("equal", _equal, tables.equal, drawn.equal),
-    Experiment("needed", _needed, tables.needed, drawn.needed),
+    Experiment("equal", lambda s, say: equal_sparsity(_psfs(s), say), tables.equal, drawn.equal),
+    Experiment("needed", lambda s, say: needed(_psfs(s), say), tables.needed, drawn.needed),
     Experiment("sizes", sizes, tables.sizes, drawn.sizes),
-    Experiment("samples", _samples, tables.samples, drawn.samples),
-    Experiment("ablation", _ablation, tables.ablation),
+    Experiment("samples", lambda s, say: sample_count(s.coordinates, s.cells, say), tables.samples, drawn.samples),
+    Experiment("ablation", lambda s, say: steps(_psfs(s)[: s.ablated], say), tables.ablation),
     Experiment("large", large, tables.large),
-    Experiment("far", _far, tables.far),
-    Experiment("rotation", _rotation, tables.rotation, drawn.rotation),
+    Experiment("far", lambda s, say: far_field(s.far, say), tables.far),
+    Experiment("rotation", lambda s, say: rotation(s.turned, s.angles, s.reach, say), tables.rotation, drawn.rotation),
     Experiment("sum", _sum, tables.total),
 ]
 

@@ -266,7 +266,7 @@ def many(bank: PsfBank, chosen: Sequence[Sample], splats: int, reach: int) -> Ro
     squares, errors = np.zeros_like(dense), []
     for place in places:
         y, x = divmod(int(place), side)
-        sample, angle = chosen[draw.integers(len(chosen))], draw.uniform(0, math.pi)
+        sample, angle = chosen[int(draw.integers(len(chosen)))], draw.uniform(0, math.pi)
         colour = draw.random(3)
         values[0, :, y, x], index[0, 0, y, x], angles[y, x] = torch.from_numpy(colour), sample.number, angle
         splatted, truth = both(bank, sample, angle, half)

@@ -9,16 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh import (
-    Dispersion,
-    FFTIntegrator,
-    KernelSplatting,
-    LensBlur,
-    PsfBank,
-    PyramidIntegrator,
-    ScanlineIntegrator,
-    ThinLens,
-)
+import torchbokeh
+from torchbokeh import KernelSplatting, LensBlur, PyramidIntegrator
 from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented, laplacian, nonzero
@@ -67,7 +59,7 @@ def lens_rows(side: int) -> Iterator[Row]:
     image = texture(side, side)
     for name, change in LENSES.items():
         values = {"focal_length": 0.05, "f_number": 1.8, "focus_distance": 2.0, "sensor_width": 0.036} | change
-        lens = ThinLens(*values.values())
+        lens = torchbokeh.ThinLens(*values.values())
         for precision in PLAIN:
             depth = near.to(precision.dtype)
             depth = torch.where(depth.isinf() & ~near.isinf(), torch.finfo(precision.dtype).max, depth)
@@ -88,8 +80,8 @@ def lens_rows(side: int) -> Iterator[Row]:
             out = LensBlur(lens, quality=quality)(image.float(), near.float())
             yield from _sound(f"LensBlur image, {quality}", f"lens: {name}, depth 1e-3 to 1e12 m", out, image)
     for axial, lateral in ((59.0, 0.0), (-100.0, 0.0), (0.3, 50.0), (0.3, -50.0)):
-        dispersion = Dispersion("BK7", axial=axial, lateral=lateral)
-        lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=dispersion)
+        dispersion = torchbokeh.Dispersion("BK7", axial=axial, lateral=lateral)
+        lens = torchbokeh.ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=dispersion)
         out = LensBlur(lens)(image.float(), near.float().clamp(0.5, 1e4))
         case = f"lens: dispersion, axial {axial:g}, lateral {lateral:g}"
         yield from _sound("LensBlur image, exact", case, out, image)
@@ -121,9 +113,9 @@ def integrator_rows(side: int) -> Iterator[Row]:
     point[..., side // 3, side // 3] = 1e6
     levels = math.ceil(math.log2(side)) + 2
     integrators: dict[str, tuple[Any, float, float]] = {
-        "ScanlineIntegrator": (ScanlineIntegrator(), 1.0, side * U64),
-        "FFTIntegrator": (FFTIntegrator(), 1.3, 16 * levels * U64),
-        "FFTIntegrator, compact": (FFTIntegrator(compact=True), 1.3, 16 * levels * U64),
+        "ScanlineIntegrator": (torchbokeh.ScanlineIntegrator(), 1.0, side * U64),
+        "FFTIntegrator": (torchbokeh.FFTIntegrator(), 1.3, 16 * levels * U64),
+        "FFTIntegrator, compact": (torchbokeh.FFTIntegrator(compact=True), 1.3, 16 * levels * U64),
         "PyramidIntegrator": (PyramidIntegrator(), 1.3, 0.0),
     }
     for name, (integrator, response, double) in integrators.items():
@@ -231,7 +223,7 @@ def bank_rows(side: int) -> Iterator[Row]:
     motion = torch.tensor([6.0, 0.0]).view(1, 2, 1, 1).expand(1, 2, side, side)
     for name, sample in ways.items():
         model = Combined(radius=8.0, length=16.0)
-        bank = PsfBank(model, [sample] * len(model.grid))
+        bank = torchbokeh.PsfBank(model, [sample] * len(model.grid))
         out = KernelSplatting(quality="exact", bank=bank)(image, even(side, side, 3.0).float(), motion=motion)
         # As many roundings as a buffer has points, each of a constant relative to its coverage.
         yield row("KernelSplatting, bank", f"psf: {name}", "float32", CONSTANT, off(out, 0.7), 1e-4)
@@ -258,7 +250,7 @@ def iteration_rows(side: int, times: int = 100) -> Iterator[Row]:
 
 
 def _by_coc(blur: LensBlur) -> Callable[[Tensor, Tensor], Tensor]:
-    return lambda image, coc: blur(image, coc=coc)  # type: ignore[no-any-return]
+    return lambda image, coc: blur(image, coc=coc)
 
 
 def gradient_rows(side: int) -> Iterator[Row]:

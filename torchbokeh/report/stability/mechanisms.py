@@ -146,8 +146,8 @@ def _normalisation(side: int) -> Iterator[Row]:
     image, profile = torch.ones(1, 1, side, side), Disc().profile()
     sums = splat_spans(image, coc, profile, integrate=True)
     splatting = KernelSplatting(quality="exact")
-    off = [off(t, 1) for t in (sums, splatting(image, coc))]
-    yield _row("division by coverage", "a constant, radii that jump", *off)
+    found = [off(t, 1) for t in (sums, splatting(image, coc))]
+    yield _row("division by coverage", "a constant, radii that jump", *found)
     holes = splat_spans(image, even(side, side, 1e8).float(), profile, integrate=True)
     kept = splatting(image, even(side, side, 1e8).float())
     lost = torch.where(holes < bank_splatting.TINY, 0.0, holes / holes)
