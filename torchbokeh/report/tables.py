@@ -25,19 +25,17 @@ def markdown(found: dict[str, Any], plots: Sequence[str]) -> str:
 def _head(found: dict[str, Any]) -> str:
     made, settings = found["machine"], found["settings"]
     versions = ", ".join(f"{k} {v}" for k, v in made.items() if k not in ("processor", "processors", "threads"))
-    return "\n\n".join(
-        [
-            "# Error and run time",
-            f"{made['processor']}, processors: {made['processors']}, threads: {made['threads']}; {versions}. "
-            f"The whole report took {found['seconds'] / 60:.1f} minutes.",
-            f"Run times are medians of up to {settings['repeat']} runs after one to warm up, all methods of a table by "
-            f"turns. Where these would take more than {settings['budget']:g} s ({settings['recipe_budget']:g} s for "
-            f"recipes as one layer, {settings['sweep_budget']:g} s from then on) there are fewer (column *runs*). The "
-            "spread is from the first to the third quartile. Compiling, and tables that depend on the largest radius "
-            "only, are not counted. SSIM, PSNR and FLIP are of `clip(x, 0, 1) ** (1/2.2)`, L1 is the sum of absolute "
-            "differences of linear values over the sum of the reference. All numbers, with fastest and slowest run, "
-            "are in `report.json`.",
-        ]
+    return (
+        "# Error and run time\n\n"
+        f"{made['processor']}, processors: {made['processors']}, threads: {made['threads']}; {versions}. "
+        f"The whole report took {found['seconds'] / 60:.1f} minutes.\n\n"
+        f"Run times are medians of up to {settings['repeat']} runs after one to warm up, all methods of a table by "
+        f"turns. Where these would take more than {settings['budget']:g} s ({settings['recipe_budget']:g} s for "
+        f"recipes as one layer, {settings['sweep_budget']:g} s from then on) there are fewer (column *runs*). The "
+        "spread is from the first to the third quartile. Compiling, and tables that depend on the largest radius "
+        "only, are not counted. SSIM, PSNR and FLIP are of `clip(x, 0, 1) ** (1/2.2)`, L1 is the sum of absolute "
+        "differences of linear values over the sum of the reference. All numbers, with fastest and slowest run, "
+        "are in `report.json`."
     )
 
 

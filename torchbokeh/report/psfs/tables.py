@@ -13,16 +13,14 @@ from torchbokeh.report.rows import Row, distinct, mean, of
 def head(found: dict[str, Any]) -> str:
     """What the analysis is, and on which machine it ran."""
     made = found["machine"]
-    return "\n\n".join(
-        [
-            "# Sparse PSFs",
-            "The analysis of Leimkühler et al. 2018 (LKS), section 7.3 and figure 10, with the PSFs of this package.",
-            f"{made['processor']}, {made['threads']} threads, torch {made['torch']}, numpy {made['numpy']}. It took "
-            f"{found['seconds'] / 60:.1f} minutes. All numbers are in `psfs.json`.",
-            "*Sparsity* is the number of points, or of squares of the quad tree, over the pixels that the dense PSF "
-            "covers. *SSIM near* is taken in the PSF and 8 px around it, *in the frame* in 513 x 513 px as in LKS, "
-            "where what is empty counts as right. L1 is the sum of absolute differences over the sum of the PSF.",
-        ]
+    return (
+        "# Sparse PSFs\n\n"
+        "The analysis of Leimkühler et al. 2018 (LKS), section 7.3 and figure 10, with the PSFs of this package.\n\n"
+        f"{made['processor']}, {made['threads']} threads, torch {made['torch']}, numpy {made['numpy']}. It took "
+        f"{found['seconds'] / 60:.1f} minutes. All numbers are in `psfs.json`.\n\n"
+        "*Sparsity* is the number of points, or of squares of the quad tree, over the pixels that the dense PSF "
+        "covers. *SSIM near* is taken in the PSF and 8 px around it, *in the frame* in 513 x 513 px as in LKS, "
+        "where what is empty counts as right. L1 is the sum of absolute differences over the sum of the PSF."
     )
 
 
@@ -38,49 +36,38 @@ def equal(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
         "PSF to PSF, and it is not said which pixels the SSIM is of. Thin PSFs are lines along x here, which suits the "
         "quad tree; it cannot be turned.",
         "![similarity against sparsity](psfs_equal.png)",
-        table(
-            [
-                "asked",
-                "method",
-                "sparsity %",
-                "SSIM near",
-                f"of r >= {THICK} px",
-                "SSIM in the frame",
-                "L1",
-                "efficiency",
-            ],
-            [_equal_row(share, method, of(rows, share=share, method=method)) for share in SHARES for method in METHODS],
+        row_table(
+            [_equal_row(of(rows, share=share, method=method)) for share in SHARES for method in METHODS],
+            f"asked | method | sparsity % | SSIM near | of r >= {THICK} px | SSIM in the frame | L1 | efficiency",
+            "{share:.1%} | {method} | {sparsity:.2f} | {ssim:.3f} | {thick:.3f} | {ssim_frame:.4f} | {l1:.3f} | "
+            "{near:.2f} / {frame:.2f}",
         ),
         "![distribution of similarity](psfs_similarity.png)",
     ]
     return section("Equal sparsity", *parts)
 
 
-def _equal_row(share: float, method: str, rows: list[Row]) -> list[str]:
+def _equal_row(rows: list[Row]) -> Row:
+    """The means of one method at one sparsity."""
     thick = [row for row in rows if row["radius"] >= THICK]
-    sparsity, frame = mean(rows, "sparsity"), mean(rows, "ssim_frame")
-    near = [f"{mean(chosen, 'ssim'):.3f}" if chosen else "-" for chosen in (rows, thick)]
-    errors = [
-        f"{frame:.4f}",
-        f"{mean(rows, 'l1'):.3f}",
-        f"{mean(rows, 'ssim') / sparsity:.2f} / {frame / sparsity:.2f}",
-    ]
-    return [f"{share:.1%}", method, f"{100 * sparsity:.2f}", *near, *errors]
+    means = {key: mean(rows, key) for key in ("sparsity", "ssim", "ssim_frame", "l1")}
+    efficiency = {"near": means["ssim"] / means["sparsity"], "frame": means["ssim_frame"] / means["sparsity"]}
+    near_thick = mean(thick, "ssim") if thick else None
+    return {**rows[0], **means, **efficiency, "sparsity": 100 * means["sparsity"], "thick": near_thick}
 
 
 def needed(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
     """The sparsity that every PSF needs."""
     domains = [row["domain"] for row in rows]
     counts = ", ".join(f"{domains.count(name)} {name}" for name in dict.fromkeys(domains))
-    header = ["", "mean %", "median %"]
-    names = ("ours", "quad tree")
-    medians = {name: float(np.median([row[name] for row in rows])) for name in names}
+    shares = {name: [100 * row[name] for row in rows] for name in ("ours", "quad tree")}
+    lines = [{"name": name, "mean": np.mean(share), "median": np.median(share)} for name, share in shares.items()]
     return section(
         "Sparsity that a PSF needs",
         "The same capsules as banks represent them (the fewest points at SSIM near >= 0.97 and L1 <= 4 %, or each "
         f"pixel where that is no more; here {counts}), and the quad tree of the same L1.",
         "![distribution of sparsity](psfs_needed.png)",
-        table(header, [[name, f"{100 * mean(rows, name):.1f}", f"{100 * medians[name]:.1f}"] for name in names]),
+        row_table(lines, " | mean % | median %", "{name} | {mean:.1f} | {median:.1f}"),
     )
 
 

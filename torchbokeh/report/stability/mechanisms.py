@@ -24,7 +24,7 @@ from torchbokeh.report.stability.renderer import bank_of
 from torchbokeh.report.stability.rows import off
 
 
-def _row(mechanism: str, case: str, without: float, kept: float) -> Row:
+def _row(mechanism: str, case: str, without: float | Tensor, kept: float | Tensor) -> Row:
     return {"mechanism": mechanism, "case": case, "without": float(without), "with": float(kept)}
 
 
@@ -59,7 +59,7 @@ def _running_sum(side: int) -> Row:
     double = splat_spans(image, coc, profile, integrate=True)
     want, far = dense_spans(image, coc, profile), _far(side, radius)
     errors = ((t.double() - want)[..., far].abs().max() for t in (torch.from_numpy(single), double))
-    return _row("running sums in double", "far-field leak of 3e5", *(float(e) for e in errors))
+    return _row("running sums in double", "far-field leak of 3e5", *errors)
 
 
 def _convolution(side: int) -> Row:
@@ -72,7 +72,7 @@ def _convolution(side: int) -> Row:
     single = torch.fft.irfft2(product, s=size)[..., reach : reach + side, reach : reach + side]
     want = convolve(image.double(), disc.double())
     errors = ((t.double() - want)[..., far].abs().max() for t in (single, convolve(image, disc)))
-    return _row("FFT of an even blur in double", "far-field leak of 3e5", *(float(e) for e in errors))
+    return _row("FFT of an even blur in double", "far-field leak of 3e5", *errors)
 
 
 def _highlights(side: int) -> Iterator[Row]:
@@ -151,21 +151,15 @@ def _normalisation(side: int) -> Iterator[Row]:
     holes = splat_spans(image, even(side, side, 1e8).float(), profile, integrate=True)
     kept = splatting(image, even(side, side, 1e8).float())
     lost = torch.where(holes < bank_splatting.TINY, 0.0, holes / holes)
-    yield _row(
-        f"radii cut to {WIDEST:g} px",
-        "a constant, radius 1e8",
-        off(lost, 1),
-        off(kept, 1),
-    )
+    yield _row(f"radii cut to {WIDEST:g} px", "a constant, radius 1e8", off(lost, 1), off(kept, 1))
 
 
 def _reciprocals() -> Row:
     """The defocus equation as printed, and in reciprocal distances, for the sky: parts that are not finite."""
     depth, focus = torch.tensor([1.0, 1e20, math.inf]), 2.0
     printed, kept = (depth - focus) / depth / focus, 1 / focus - depth.reciprocal()
-    return _row(
-        "reciprocal distances", "CoC that is not finite", *(float((~t.isfinite()).sum()) for t in (printed, kept))
-    )
+    strange = [(~t.isfinite()).sum() for t in (printed, kept)]
+    return _row("reciprocal distances", "CoC that is not finite", *strange)
 
 
 def _confined(side: int) -> Row:

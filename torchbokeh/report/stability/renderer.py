@@ -16,8 +16,8 @@ from torchbokeh.report.stability.oracles import composed
 
 Run = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
-Asked = Callable[[Tensor, Tensor, Tensor | None], dict[str, Any]]
-"""The arguments that a part of this package takes for ``(image, coc, motion)``, by name but for the image: ``""``."""
+Inputs = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, dict[str, Any]]]
+"""What a part of this package is given for ``(image, coc, motion)``: the image, and all else by name."""
 
 WAY = (5.0, -3.0)
 """Motion in px where a renderer needs one and a case has none."""
@@ -99,46 +99,47 @@ class Renderer:
         return way.expand(len(case.image), 2, *case.image.shape[2:]).contiguous()
 
 
-def ask(call: Callable[..., Any], asked: Asked, image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
+def call_with(call: Callable[..., Any], inputs: Inputs, image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
     """Call a part of this package with a picture."""
-    arguments = asked(image, coc, motion)
-    return call(arguments.pop(""), **arguments)
+    first, others = inputs(image, coc, motion)
+    return call(first, **others)
 
 
-def of_blur(name: str, kind: str, blur: LensBlur, asked: Asked, **more: Any) -> Renderer:
+def blur_renderer(name: str, kind: str, blur: LensBlur, inputs: Inputs, **more: Any) -> Renderer:
     """A `LensBlur`: its oracle is `composed`, or itself in double where it merges or asks a bank."""
-    run, plan, slow = (partial(ask, call, asked) for call in (blur, blur.plan, partial(composed, blur)))
+    run, plan, slow = (partial(call_with, call, inputs) for call in (blur, blur.plan, partial(composed, blur)))
     oracle, sums = (slow, None) if blur.quality == "exact" and kind != "bank" else (run, slow)
     return Renderer(name, kind, run, oracle, plan, quality=blur.quality, sums=sums, **more)
 
 
-def of_splatting(name: str, kind: str, splatting: KernelSplatting, slow: Run, **more: Any) -> Renderer:
+def splatting_renderer(name: str, kind: str, splatting: KernelSplatting, slow: Run, **more: Any) -> Renderer:
     """A `KernelSplatting`: its oracle is ``slow``, or itself in double where it merges or asks a bank."""
-    run, plan = partial(ask, splatting, picture), partial(ask, splatting.plan, picture)
+    run, plan = partial(call_with, splatting, picture), partial(call_with, splatting.plan, picture)
     oracle, sums = (slow, None) if kind == "splat" else (run, slow)
     return Renderer(name, kind, run, oracle, plan, quality=splatting.quality, sums=sums, **more)
 
 
-def picture(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def picture(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """A picture and its CoC."""
-    return {"": image, "coc": coc}
+    return image, {"coc": coc}
 
 
-def moving(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def moving(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """The same in motion."""
-    return {"": image, "coc": coc, "motion": motion}
+    return image, {"coc": coc, "motion": motion}
 
 
-def layered(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def layered(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """The two layers of `layers_of`."""
     rgba, radius = layers_of(image, coc)
-    return {"": rgba, "coc": radius}
+    return rgba, {"coc": radius}
 
 
-def layered_moving(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def moving_layers(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """The same, moving in opposite ways."""
     assert motion is not None
-    return {**layered(image, coc, None), "motion": torch.stack([motion, -motion], 1)}
+    rgba, radius = layers_of(image, coc)
+    return rgba, {"coc": radius, "motion": torch.stack([motion, -motion], 1)}
 
 
 @lru_cache

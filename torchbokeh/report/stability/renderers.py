@@ -25,15 +25,15 @@ from torchbokeh.report.stability.oracles import gathered, splatted, viewed
 from torchbokeh.report.stability.renderer import (
     VIEWS,
     Renderer,
-    ask,
     bank_of,
+    blur_renderer,
+    call_with,
     layered,
-    layered_moving,
     layers_of,
     moving,
-    of_blur,
-    of_splatting,
+    moving_layers,
     picture,
+    splatting_renderer,
 )
 
 CUT_TO = 6.0
@@ -55,17 +55,17 @@ def renderers() -> Iterator[Renderer]:
     for quality in QUALITIES:
         kind = "splat" if quality.merging is None else "merged"
         name = f"KernelSplatting, {quality.name}"
-        yield of_splatting(name, kind, KernelSplatting(quality=quality.name), dense)
+        yield splatting_renderer(name, kind, KernelSplatting(quality=quality.name), dense)
     for quality in QUALITIES:
         blur = LensBlur(quality=quality.name)
-        yield of_blur(f"LensBlur image, {quality.name}", "composed", blur, picture)
-        yield of_blur(f"LensBlur layers, {quality.name}", "layers", blur, layered)
-        yield of_blur(f"LensBlur motion, {quality.name}", "bank", blur, moving, moves=True, bank="combined")
+        yield blur_renderer(f"LensBlur image, {quality.name}", "composed", blur, picture)
+        yield blur_renderer(f"LensBlur layers, {quality.name}", "layers", blur, layered)
+        yield blur_renderer(f"LensBlur motion, {quality.name}", "bank", blur, moving, moves=True, bank="combined")
     for name in ("stylized", "physical-lens"):
         bank = bank_of(name)
         splatting, slow = KernelSplatting(quality="exact", bank=bank), lambda i, c, _, bank=bank: splatted(bank, i, c)
-        yield of_splatting(f"KernelSplatting, bank {name}", "bank", splatting, slow, bank=name)
-    run = partial(ask, AccumulationBuffer(views=VIEWS), layered)
+        yield splatting_renderer(f"KernelSplatting, bank {name}", "bank", splatting, slow, bank=name)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS), layered)
     yield Renderer("AccumulationBuffer layers", "views", run, lambda i, c, _: viewed(*layers_of(i, c), VIEWS))
     yield from options()
     yield Renderer("reconstruct", "samples", _samples, _samples, moves=True, bank="combined", sums=gathered)
@@ -80,18 +80,18 @@ def options() -> Iterator[Renderer]:
             yield Renderer(name, "colours", run, run, plan, widths=dispersed, quality=quality)
         bank: dict[str, Any] = {"moves": True, "bank": "combined"}
         blur = LensBlur(quality=quality)
-        yield of_blur(f"LensBlur approaching, {quality}", "bank", blur, _approaching, widths=_doubled, **bank)
+        yield blur_renderer(f"LensBlur approaching, {quality}", "bank", blur, _approaching, widths=_doubled, **bank)
         blur = LensBlur(quality=quality, shutter="start")
-        yield of_blur(f"LensBlur curved motion, {quality}", "bank", blur, _curved, ahead=1.25, **bank)
-    yield of_blur("LensBlur 6-gon, exact", "composed", LensBlur(aperture="6-gon"), picture)
-    yield of_blur("LensBlur background, exact", "composed", LensBlur(), _background)
+        yield blur_renderer(f"LensBlur curved motion, {quality}", "bank", blur, _curved, ahead=1.25, **bank)
+    yield blur_renderer("LensBlur 6-gon, exact", "composed", LensBlur(aperture="6-gon"), picture)
+    yield blur_renderer("LensBlur background, exact", "composed", LensBlur(), _background)
     blur = LensBlur(margin=MARGIN, max_coc=CUT_TO, quality="balanced")
-    yield of_blur("LensBlur margin and max_coc, balanced", "composed", blur, _margin, widths=_cut)
-    run = partial(ask, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1), layered)
+    yield blur_renderer("LensBlur margin and max_coc, balanced", "composed", blur, _margin, widths=_cut)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1), layered)
     yield Renderer("AccumulationBuffer layers, coarser and shared", "views", run, run, texels=TEXELS)
-    run = partial(ask, AccumulationBuffer(views=VIEWS, subsamples=4), layered)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS, subsamples=4), layered)
     yield Renderer("AccumulationBuffer layers, sub-samples", "rays", run, run)
-    run = partial(ask, AccumulationBuffer(views=VIEWS), layered_moving)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS), moving_layers)
     yield Renderer("AccumulationBuffer layers, in motion", "views", run, _moving_viewed, moves=True)
     for spectrum in ("rgb", "continuous"):
         run = partial(_chromatic_views, spectrum)
@@ -143,30 +143,30 @@ def _coloured_plan(spectrum: str, quality: str, image: Tensor, coc: Tensor, moti
     return LensBlur(dispersing(image.shape[3], spectrum), quality=quality).plan(image, coc=coc)
 
 
-def _approaching(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
-    return {"": image, "coc": coc, "motion": motion, "shutter_depth": torch.cat([coc / 2, 2 * coc], 1)}
+def _approaching(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc, "motion": motion, "shutter_depth": torch.cat([coc / 2, 2 * coc], 1)}
 
 
 def _doubled(coc: Tensor) -> tuple[Tensor, Tensor]:
     return coc / 2, 2 * coc
 
 
-def _curved(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def _curved(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """Half of the motion, as much to its right, and a quarter of it back."""
     assert motion is not None
     right = torch.stack([-motion[:, 1], motion[:, 0]], 1)
-    return {"": image, "coc": coc, "motion": (motion / 2, right / 2, -motion / 4)}
+    return image, {"coc": coc, "motion": (motion / 2, right / 2, -motion / 4)}
 
 
-def _background(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
-    return {"": image, "coc": coc, "background": (image.flip(-1), coc.abs())}
+def _background(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc, "background": (image.flip(-1), coc.abs())}
 
 
-def _margin(image: Tensor, coc: Tensor, motion: Tensor | None) -> dict[str, Any]:
+def _margin(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
     """The picture goes on beyond the sensor, with its last pixels."""
     if image.numel():
         image, coc = (F.pad(t, (MARGIN,) * 4, mode="replicate") for t in (image, coc))
-    return {"": image, "coc": coc}
+    return image, {"coc": coc}
 
 
 def _cut(coc: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,5 +181,5 @@ def _moving_viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
 
 def _chromatic_views(spectrum: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
     buffer = ChromaticAccumulation(dispersing(image.shape[3], spectrum), views=VIEWS)
-    out: Tensor = ask(buffer, layered, image, coc, motion)
+    out: Tensor = call_with(buffer, layered, image, coc, motion)
     return out
