@@ -1,7 +1,7 @@
 # ruff: noqa: F401
 """What the report takes of the inside of the package, in one place: all else it knows by its public names.
 
-A renamed or moved part of the package is renamed here, and where ``report`` says so.
+What is renamed or moved inside the package is renamed here. ``torchbokeh.ops`` and ``torchbokeh.psfs`` count as public.
 """
 
 from torchbokeh.banks import highlights as bank_highlights
@@ -15,6 +15,7 @@ from torchbokeh.banks.splat import bank_of_motion, splat_bank
 from torchbokeh.compose.surfaces import CERTAIN, COARSE, FOREGROUND, bin_centres
 from torchbokeh.learn.export import OPSET
 from torchbokeh.lens.dispersion import FEWEST, SEEN, Spectrum
+from torchbokeh.ops.splat import _splat_spans_torch as splat_definition
 from torchbokeh.picture.coc import WIDEST
 from torchbokeh.picture.motion import ADVANCE, Motion, ways
 from torchbokeh.plan.quality import QUALITIES

@@ -152,10 +152,7 @@ def _reconstruction(scene: _Scene) -> dict[str, Work]:
     return works
 
 
-KINDS: dict[str, Callable[[_Scene], dict[str, Work]]] = {
-    "synthesis": _synthesis,
-    "reconstruction": _reconstruction,
-}
+KINDS: dict[str, Callable[[_Scene], dict[str, Work]]] = {"synthesis": _synthesis, "reconstruction": _reconstruction}
 
 
 def like_lks(

@@ -9,8 +9,8 @@ from torch.nn import functional as F
 
 import torchbokeh
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.splat import _splat_spans_torch
 from torchbokeh.psfs.aperture import Disc
+from torchbokeh.report.internals import splat_definition
 from torchbokeh.report.speed.methods import Method, own_methods, own_name
 
 QUALITIES = ("exact", "balanced")
@@ -47,7 +47,7 @@ def _lens_blur(blur: torchbokeh.LensBlur, image: Tensor, coc: Tensor) -> Tensor:
 
 def interval_splat(image: Tensor, coc: Tensor) -> Tensor:
     """The torch definition of the exact one-layer blur, without the adjoint that this package gives it."""
-    out = _splat_spans_torch(torch.cat([image, torch.ones_like(coc)], 1), coc, Disc().profile(), True)
+    out = splat_definition(torch.cat([image, torch.ones_like(coc)], 1), coc, Disc().profile(), True)
     return out[:, :-1] / out[:, -1:].clamp_min(TINY)
 
 
