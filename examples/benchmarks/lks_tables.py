@@ -15,10 +15,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchbokeh.report.motion.experiments import like_lks
+from torchbokeh.report.motion.experiments import like_lks, like_lks_table
 from torchbokeh.report.settings import Settings
 from torchbokeh.report.sheets import write_sheet
-from torchbokeh.report.tables import like_lks_table
 
 
 def main() -> None:

@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
+from torchbokeh.report.stability import checks
 from torchbokeh.report.stability.bounds import PRECISIONS
 from torchbokeh.report.stability.cases import Case, beyond, cases, even
 from torchbokeh.report.stability.mechanisms import mechanism_rows
-from torchbokeh.report.stability.options import options
+from torchbokeh.report.stability.pictures import render_rows, rows_of
 from torchbokeh.report.stability.renderer import Renderer
-from torchbokeh.report.stability.renderers import renderers
+from torchbokeh.report.stability.renderers import options, renderers
 from torchbokeh.report.stability.rows import row
-from torchbokeh.report.stability.run import QUICK, checks, render_rows, rows_of
 from torchbokeh.report.stability.scenes import scene_rows
 from torchbokeh.report.stability.sweeps import plan_rows, sweep_rows
 
@@ -153,12 +153,11 @@ def test_every_mechanism_is_of_use() -> None:
 @pytest.mark.slow
 def test_the_chapter_is_written_whole(tmp_path) -> None:
     pytest.importorskip("matplotlib")
-    from torchbokeh.report.stability.run import run_stability
-    from torchbokeh.report.stability.write import write_stability
+    from torchbokeh.report.chapters import STABILITY, write_chapter
 
     said: list[str] = []
-    found = run_stability(QUICK, said.append)
-    paths = write_stability(found, tmp_path)
+    found = STABILITY.run(STABILITY.settings.quick(), said.append)
+    paths = write_chapter(STABILITY, found, tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {p.name for p in paths}
     again = json.loads((tmp_path / "stability.json").read_text(encoding="utf-8"))
     assert len(again["rows"]) == len(found["rows"])

@@ -75,34 +75,21 @@ def test_a_full_disk(tmp_path: Path) -> None:
         assert files in ("[]", "['dataset.json']", "['plot.png', 'report.json']"), (name, limit)
 
 
-WRITING = {
-    "report": ("report", "torchbokeh.report.run.run_experiments", "torchbokeh.report.write.{}"),
-    "report --stability": (
-        "stability",
-        "torchbokeh.report.stability.run_stability",
-        "torchbokeh.report.stability.write.{}",
-    ),
-    "psfs analyse": ("psfs", "torchbokeh.report.psfs.analysis.analyse", "torchbokeh.psf_{}"),
-}
+WRITING = {"report": "REPORT", "report --stability": "STABILITY", "psfs analyse": "PSFS"}
 
 
 @pytest.fixture(params=WRITING)
 def reporting(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, str], int]:
     """A command that has a text, numbers and two plots to write as soon as it starts."""
     figure = pytest.importorskip("matplotlib.figure").Figure
-    name, compute, parts = WRITING[request.param]
+    from torchbokeh.report import chapters
+
+    name = WRITING[request.param]
 
     def run(folder: Path, text: str) -> int:
-        monkeypatch.setattr(compute, lambda *_: {"rows": text, "mechanisms": [], "experiments": []})
-        if name == "stability":
-            monkeypatch.setattr(parts.format("stability_markdown"), lambda *_: text)
-            for plot in ("_bounds", "_mechanisms"):
-                monkeypatch.setattr(parts.format(plot), lambda _: figure((len(text), 1)))
-        else:
-            markdown, draw = ("tables.markdown", "plots.draw") if name == "psfs" else ("markdown", "draw")
-            monkeypatch.setattr(parts.format(markdown), lambda *_: text)
-            plots = {f"{name}_{k}.png": figure((len(text), 1)) for k in range(2)}
-            monkeypatch.setattr(parts.format(draw), lambda _: plots)
+        plots = {f"{name}_{k}.png": figure((len(text), 1)) for k in range(2)}
+        found = {"run": lambda *_: {"rows": text}, "markdown": lambda *_: text, "draw": lambda _: plots}
+        monkeypatch.setattr(chapters, name, getattr(chapters, name)._replace(**found))
         return main([*request.param.split(), "--quick", "--out", str(folder)])
 
     return run

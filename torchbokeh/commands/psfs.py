@@ -1,7 +1,6 @@
 """The command ``torchbokeh psfs``: build banks of point-spread functions, look at them, tabulate and analyse them."""
 
 import argparse
-import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -105,15 +104,7 @@ def _table(args: argparse.Namespace) -> None:
 def _analyse(args: argparse.Namespace) -> None:
     if find_spec("matplotlib") is None:
         raise ValueError("the analysis draws plots with matplotlib: pip install torchbokeh[report]")
-    from torchbokeh.report.psfs.analysis import Settings, analyse, quick
-    from torchbokeh.report.psfs.tables import write_analysis
-    from torchbokeh.report.write import prepare
+    from torchbokeh.report.chapters import PSFS
+    from torchbokeh.report.command import make
 
-    prepare(args.out)
-    start = time.perf_counter()
-
-    def say(line: str) -> None:
-        print(f"[{time.perf_counter() - start:4.0f} s] {line}", file=sys.stderr, flush=True)
-
-    for path in write_analysis(analyse(quick() if args.quick else Settings(), say), args.out):
-        print(path)
+    make(PSFS, args.out, quick=args.quick)

@@ -4,9 +4,13 @@ import argparse
 import re
 import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchbokeh.report.chapters import Chapter
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
@@ -47,56 +51,53 @@ def run(args: argparse.Namespace) -> None:
     """
     if find_spec("matplotlib") is None:
         raise ValueError("the report draws plots with matplotlib: pip install torchbokeh[report]")
-    import torch
-
-    from torchbokeh.report.run import EXPERIMENTS, run_experiments
+    from torchbokeh.report.chapters import REPORT, STABILITY
+    from torchbokeh.report.experiments import EXPERIMENTS
     from torchbokeh.report.scenes import NAMES
-    from torchbokeh.report.settings import Settings, quick
-    from torchbokeh.report.write import prepare, write_report
 
-    if args.stability:
-        _stability(args)
-        return
-    scenes, only = args.scenes or NAMES, args.only or tuple(EXPERIMENTS)
-    for flag, asked, known in (("--scenes", scenes, NAMES), ("--only", only, EXPERIMENTS)):
-        unknown = [name for name in asked if name not in known]
+    if args.stability and (args.scenes or args.only):
+        raise ValueError("--stability: expected no --scenes and no --only beside it, got one")
+    experiments = [experiment.name for experiment in EXPERIMENTS]
+    for flag, asked, known in (("--scenes", args.scenes, NAMES), ("--only", args.only, experiments)):
+        unknown = [name for name in asked or () if name not in known]
         if unknown:
             raise ValueError(f"{flag}: expected some of {', '.join(known)}, got {unknown[0]!r}")
-    prepare(args.out)
-    if args.threads:
-        torch.set_num_threads(args.threads)
-    say = _teller()
-    settings = quick(scenes) if args.quick else Settings(scenes=scenes)
-    found = run_experiments(settings, say, only)
-    say("writing")
-    for path in write_report(found, args.out):
-        print(path)
+    chapter = STABILITY if args.stability else REPORT
+    if args.only:
+        chapter = chapter._replace(run=partial(chapter.run, only=args.only))
+    make(chapter, args.out, quick=args.quick, threads=args.threads, **{"scenes": args.scenes} if args.scenes else {})
 
 
-def _stability(args: argparse.Namespace) -> None:
+def make(chapter: "Chapter", folder: Path, *, quick: bool, threads: int | None = None, **settings: Any) -> None:
+    """Run a chapter, say on stderr what is being measured, and print the files written.
+
+    Args:
+        chapter: one of `torchbokeh.report.chapters`.
+        folder: made where it is missing.
+        quick: shows that everything runs.
+        threads: of the CPU; PyTorch's choice if None.
+        settings: those of the chapter that are not as usual.
+
+    Raises:
+        ValueError: a folder that cannot be written.
+    """
     import torch
 
-    from torchbokeh.report.stability.run import QUICK, StabilitySettings, run_stability
-    from torchbokeh.report.stability.write import write_stability
+    from torchbokeh.report.chapters import write_chapter
     from torchbokeh.report.write import prepare
 
-    if args.scenes or args.only:
-        raise ValueError("--stability: expected no --scenes and no --only beside it, got one")
-    prepare(args.out)
-    if args.threads:
-        torch.set_num_threads(args.threads)
-    found = run_stability(QUICK if args.quick else StabilitySettings(), _teller())
-    for path in write_stability(found, args.out):
-        print(path)
-
-
-def _teller() -> Callable[[str], None]:
+    prepare(folder)
+    if threads:
+        torch.set_num_threads(threads)
     start = time.perf_counter()
 
     def say(line: str) -> None:
         print(f"[{time.perf_counter() - start:4.0f} s] {line}", file=sys.stderr, flush=True)
 
-    return say
+    found = chapter.run((chapter.settings.quick if quick else chapter.settings)(**settings), say)
+    say("writing")
+    for path in write_chapter(chapter, found, folder):
+        print(path)
 
 
 def _names(text: str) -> tuple[str, ...]:

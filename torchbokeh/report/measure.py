@@ -66,15 +66,18 @@ def measure(works: Mapping[str, Work], repeat: int, budget: float = math.inf) ->
     results: dict[str, Tensor] = {}
 
     def timed(name: str, work: Work) -> tuple[float]:
-        start = time.perf_counter()
-        result = work()
-        seconds = time.perf_counter() - start
-        results.setdefault(name, result)
-        return (seconds,)
+        return work_seconds(lambda: results.setdefault(name, work()))
 
     with torch.inference_mode():
         found = by_turns({name: partial(timed, name, work) for name, work in works.items()}, repeat, budget)
     return {name: Timing(tuple(run[0] for run in found[name]), results[name]) for name in works}
+
+
+def work_seconds(work: Work) -> tuple[float]:
+    """The seconds that something takes, as the only part of it, for `by_turns`."""
+    start = time.perf_counter()
+    work()
+    return (time.perf_counter() - start,)
 
 
 def by_turns(

@@ -1,59 +1,31 @@
 """All experiments, one after the other, and everything that a reader of their numbers wants to know."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Any
 
-from torchbokeh.report.chromatic.experiments import chromatic_bands, chromatic_samples, chromatic_truth, importance
+from torchbokeh.report.experiment import find_rows
+from torchbokeh.report.experiments import EXPERIMENTS
 from torchbokeh.report.machine import machine
 from torchbokeh.report.measure import flip_is_there
-from torchbokeh.report.motion.experiments import like_lks, with_motion
+from torchbokeh.report.rows import Say
 from torchbokeh.report.settings import Settings
 from torchbokeh.report.speed.baselines import absent
-from torchbokeh.report.speed.blur import against_layers, against_truth, left_out
-from torchbokeh.report.speed.experiments import (
-    Say,
-    against_pixels,
-    against_radius,
-    against_threads,
-    methods,
-    one_layer,
-)
-from torchbokeh.report.speed.exported import can_export, exported
-from torchbokeh.report.speed.gradients import gradient_methods, gradients
+from torchbokeh.report.speed.exported import can_export
 from torchbokeh.report.speed.memory import is_known
-from torchbokeh.report.speed.stages import stages
+from torchbokeh.report.speed.registry import every_method
 
 FORMAT = 1
 """Of ``report.json``; it goes up when the meaning of a field changes."""
 
-EXPERIMENTS = {
-    "one_layer": one_layer,
-    "truth": against_truth,
-    "radius": against_radius,
-    "pixels": against_pixels,
-    "layers": against_layers,
-    "threads": against_threads,
-    "gradients": gradients,
-    "export": exported,
-    "motion": with_motion,
-    "like_lks": like_lks,
-    "chromatic_truth": chromatic_truth,
-    "chromatic_samples": chromatic_samples,
-    "chromatic_bands": chromatic_bands,
-    "importance": importance,
-    "left_out": left_out,
-    "stages": stages,
-}
 
-
-def run_experiments(settings: Settings, say: Say, only: Sequence[str] = tuple(EXPERIMENTS)) -> dict[str, Any]:
+def run_experiments(settings: Settings, say: Say, only: Collection[str] | None = None) -> dict[str, Any]:
     """Run everything, or some of it.
 
     Args:
         settings: sizes and repetitions.
         say: is told in a line what comes next.
-        only: names of the experiments to run; the others have no rows.
+        only: names of the experiments to run; the others have no rows. All if None.
 
     Returns:
         What goes into ``report.json``: ``format``, ``machine``, ``settings``, ``methods`` with their descriptions,
@@ -61,13 +33,13 @@ def run_experiments(settings: Settings, say: Say, only: Sequence[str] = tuple(EX
         ``seconds``, how long it all took.
     """
     start = time.perf_counter()
-    rows = {name: experiment(settings, say) if name in only else [] for name, experiment in EXPERIMENTS.items()}
-    compared = {**methods(), **gradient_methods()}.values()
+    rows = find_rows(EXPERIMENTS, settings, say, only)
+    methods = every_method().values()
     return {
         "format": FORMAT,
         "machine": machine(),
         "settings": settings.row(),
-        "methods": [{"name": m.name, "family": m.family, "description": m.description} for m in compared],
+        "methods": [{"name": m.name, "family": m.family, "description": m.description} for m in methods],
         "absent": _absent(),
         "experiments": rows,
         "seconds": time.perf_counter() - start,

@@ -7,10 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.scenes import RECIPES
-from torchbokeh.scenes.camera import Camera
-from torchbokeh.scenes.scene import Scene
+from torchbokeh import AccumulationBuffer, Dispersion, ThinLens
+from torchbokeh.scenes import RECIPES, Camera, Scene
 
 PHOTO = "photo"
 NAMES = (PHOTO, *RECIPES)
@@ -88,6 +86,13 @@ def still(name: str, size: int, radius: float) -> tuple[Scene, Camera]:
         raise ValueError(f"scenes: expected some of {', '.join(NAMES)}, got {name!r}")
     scene, camera = RECIPES[name](0, size=(size, size), blur=radius)
     return scene, replace(camera, shutter=0.0)
+
+
+def with_dispersion(camera: Camera, dispersion: Dispersion) -> Camera:
+    """The same camera with a lens that disperses."""
+    lens = camera.lens
+    values = lens.focal_length, lens.f_number, lens.focus_distance, lens.sensor_width
+    return replace(camera, lens=ThinLens(*values, dispersion=dispersion))
 
 
 @lru_cache(maxsize=16)

@@ -1,13 +1,34 @@
 """How large a report is: sizes, radii and repetitions of its experiments."""
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Self
 
+from torchbokeh.report.rows import Row
 from torchbokeh.report.scenes import NAMES
 
 
+def sized(full: Any, quick: Any) -> Any:
+    """A setting: what it is, and what it is where a report only shows that everything runs."""
+    return field(default=full, metadata={"quick": quick})
+
+
 @dataclass(frozen=True)
-class Settings:
+class Sizes:
+    """What all settings have in common."""
+
+    @classmethod
+    def quick(cls, **others: Any) -> Self:
+        """Small enough for a test: it shows that everything runs, its numbers mean little."""
+        small = {f.name: f.metadata["quick"] for f in fields(cls) if "quick" in f.metadata}
+        return cls(**(small | others))
+
+    def row(self) -> Row:
+        """Everything, for the record."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Settings(Sizes):
     """Sizes are sides of square pictures in px, radii are of the largest blur in px.
 
     Attributes:
@@ -51,84 +72,39 @@ class Settings:
     """
 
     scenes: tuple[str, ...] = NAMES
-    repeat: int = 5
-    budget: float = 2.0
-    cap: float = 20.0
-    photo_size: int = 1024
-    photo_radii: tuple[float, ...] = (25.0, 100.0)
-    recipe_size: int = 512
-    recipe_radius: float = 25.0
-    recipe_budget: float = 1.0
-    recipe_cap: float = 0.6
-    truth_size: int = 256
-    truth_radius: float = 13.0
-    truth_views: int = 512
-    sweep_budget: float = 1.5
-    sweep_cap: float = 12.0
-    sweep_radii: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
-    sweep_sizes: tuple[int, ...] = (512, 1024, 2048, 4096)
-    memory_sizes: tuple[int, ...] = (1024, 4096)
-    sweep_radius: float = 25.0
-    layer_counts: tuple[int, ...] = (1, 2, 4, 8, 16)
-    motion_size: int = 1024
-    motions: tuple[tuple[float, float], ...] = ((25.0, 40.0), (60.0, 120.0))
-    gradient_sizes: tuple[int, ...] = (256, 512)
-    gradient_radii: tuple[float, ...] = (12.0, 50.0)
+    repeat: int = sized(5, 2)
+    budget: float = sized(2.0, 0.3)
+    cap: float = sized(20.0, 0.15)
+    photo_size: int = sized(1024, 160)
+    photo_radii: tuple[float, ...] = sized((25.0, 100.0), (8.0, 20.0))
+    recipe_size: int = sized(512, 96)
+    recipe_radius: float = sized(25.0, 8.0)
+    recipe_budget: float = sized(1.0, 0.3)
+    recipe_cap: float = sized(0.6, 0.05)
+    truth_size: int = sized(256, 64)
+    truth_radius: float = sized(13.0, 5.0)
+    truth_views: int = sized(512, 16)
+    sweep_budget: float = sized(1.5, 0.3)
+    sweep_cap: float = sized(12.0, 0.15)
+    sweep_radii: tuple[float, ...] = sized((2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0), (2.0, 8.0, 20.0))
+    sweep_sizes: tuple[int, ...] = sized((512, 1024, 2048, 4096), (64, 128))
+    memory_sizes: tuple[int, ...] = sized((1024, 4096), (128,))
+    sweep_radius: float = sized(25.0, 8.0)
+    layer_counts: tuple[int, ...] = sized((1, 2, 4, 8, 16), (1, 4))
+    motion_size: int = sized(1024, 64)
+    motions: tuple[tuple[float, float], ...] = sized(((25.0, 40.0), (60.0, 120.0)), ((6.0, 12.0),))
+    gradient_sizes: tuple[int, ...] = sized((256, 512), (48,))
+    gradient_radii: tuple[float, ...] = sized((12.0, 50.0), (4.0,))
     gradient_memory: float = 6e9
-    export_qualities: tuple[str, ...] = ("balanced", "fast")
-    export_sizes: tuple[int, ...] = (256, 512)
-    chromatic_scenes: tuple[str, ...] = ("coins", "ramp")
-    chromatic_strengths: tuple[tuple[float, float], ...] = ((0.5, 0.0), (0.0, 0.03), (0.5, 0.03))
-    chromatic_size: int = 256
-    chromatic_radius: float = 13.0
-    chromatic_truth: int = 4096
-    chromatic_views: tuple[int, ...] = (64, 256, 1024)
-    chromatic_repeat: int = 2
-    sample_views: tuple[int, ...] = (16, 64, 256, 1024)
-    band_views: int = 510
+    export_qualities: tuple[str, ...] = sized(("balanced", "fast"), ())
+    export_sizes: tuple[int, ...] = sized((256, 512), (48,))
+    chromatic_scenes: tuple[str, ...] = sized(("coins", "ramp"), ("coins",))
+    chromatic_strengths: tuple[tuple[float, float], ...] = sized(((0.5, 0.0), (0.0, 0.03), (0.5, 0.03)), ((0.5, 0.03),))
+    chromatic_size: int = sized(256, 48)
+    chromatic_radius: float = sized(13.0, 5.0)
+    chromatic_truth: int = sized(4096, 32)
+    chromatic_views: tuple[int, ...] = sized((64, 256, 1024), (6, 16))
+    chromatic_repeat: int = sized(2, 1)
+    sample_views: tuple[int, ...] = sized((16, 64, 256, 1024), (6, 12, 24))
+    band_views: int = sized(510, 96)
     importance_seeds: int = 16
-
-    def row(self) -> dict[str, Any]:
-        """Everything, for the record."""
-        return asdict(self)
-
-
-def quick(scenes: tuple[str, ...] = NAMES) -> Settings:
-    """Small enough for a test: it shows that everything runs, its numbers mean little."""
-    return Settings(
-        scenes=scenes,
-        repeat=2,
-        budget=0.3,
-        cap=0.15,
-        photo_size=160,
-        photo_radii=(8.0, 20.0),
-        recipe_size=96,
-        recipe_radius=8.0,
-        recipe_budget=0.3,
-        recipe_cap=0.05,
-        truth_size=64,
-        truth_radius=5.0,
-        truth_views=16,
-        sweep_budget=0.3,
-        sweep_cap=0.15,
-        sweep_radii=(2.0, 8.0, 20.0),
-        sweep_sizes=(64, 128),
-        memory_sizes=(128,),
-        sweep_radius=8.0,
-        layer_counts=(1, 4),
-        motion_size=64,
-        motions=((6.0, 12.0),),
-        gradient_sizes=(48,),
-        gradient_radii=(4.0,),
-        export_qualities=(),
-        export_sizes=(48,),
-        chromatic_scenes=("coins",),
-        chromatic_strengths=((0.5, 0.03),),
-        chromatic_size=48,
-        chromatic_radius=5.0,
-        chromatic_truth=32,
-        chromatic_views=(6, 16),
-        chromatic_repeat=1,
-        sample_views=(6, 12, 24),
-        band_views=96,
-    )

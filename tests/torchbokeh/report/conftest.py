@@ -5,7 +5,7 @@ import torch
 
 from torchbokeh.report.run import run_experiments
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed import experiments, gradients
+from torchbokeh.report.speed import gradients, sweeps
 
 TINY = Settings(
     scenes=("photo", "coins"),
@@ -52,7 +52,7 @@ def report():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiments, "peak_memory", lambda name, size, radius: size * size * (40 + len(name)))
+        patch.setattr(sweeps, "peak_memory", lambda name, size, radius: size * size * (40 + len(name)))
         patch.setattr(gradients, "peak_memory", lambda name, size, radius, backward: size * size * len(name))
         found = run_experiments(TINY, lambda line: None)
     torch.set_num_threads(before)

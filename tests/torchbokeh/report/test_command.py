@@ -6,12 +6,12 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from torchbokeh.report import command
-from torchbokeh.report import run as run_module
-from torchbokeh.report import settings as settings_module
+from torchbokeh.report import chapters, command
 from torchbokeh.report.command import add_report
-from torchbokeh.report.speed import experiments, gradients
-from torchbokeh.report.stability.run import QUICK, StabilitySettings
+from torchbokeh.report.experiments import EXPERIMENTS
+from torchbokeh.report.settings import Settings
+from torchbokeh.report.speed import gradients, sweeps
+from torchbokeh.report.stability.chapter import StabilitySettings
 
 
 def run(*flags):
@@ -23,7 +23,7 @@ def run(*flags):
 
 @pytest.mark.slow
 def test_a_quick_report_is_written_whole(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(experiments, "peak_memory", lambda *args: None)
+    monkeypatch.setattr(sweeps, "peak_memory", lambda *args: None)
     monkeypatch.setattr(gradients, "peak_memory", lambda *args, **kwargs: None)
     run("--quick", "--scenes", "photo,rain", "--out", str(tmp_path / "new"), "--threads", "1")
     said = capsys.readouterr()
@@ -40,24 +40,36 @@ def test_only_some_experiments_are_run(tmp_path, monkeypatch):
     monkeypatch.setattr(gradients, "peak_memory", lambda *args, **kwargs: None)
     run("--quick", "--only", "gradients", "--out", str(tmp_path))
     found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert found["experiments"].keys() == run_module.EXPERIMENTS.keys()
+    assert found["experiments"].keys() == {experiment.name for experiment in EXPERIMENTS}
     assert [name for name, rows in found["experiments"].items() if rows] == ["gradients"]
     headings = re.findall("^## (.*)$", (tmp_path / "report.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert headings == ["Forward and backward", "What the methods are"]
 
 
-def test_flags_choose_scenes_and_settings(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(run_module, "run_experiments", lambda settings, say, only: asked.append((settings, only)))
-    monkeypatch.setattr("torchbokeh.report.write.write_report", lambda found, folder: [])
+@pytest.fixture
+def asked(monkeypatch):
+    """What chapters are asked for, none of which is run."""
+    found = []
+
+    def replace(name):
+        chapter = getattr(chapters, name)
+        run = lambda settings, say, **only: found.append((settings, only))  # noqa: E731
+        written = {"draw": lambda found: {}, "markdown": lambda found, plots: ""}
+        monkeypatch.setattr(chapters, name, chapter._replace(run=run, **written))
+
+    for name in ("REPORT", "STABILITY"):
+        replace(name)
+    return found
+
+
+def test_flags_choose_scenes_and_settings(tmp_path, asked):
     run("--out", str(tmp_path))
     run("--out", str(tmp_path), "--scenes", "coins, photo,coins", "--quick")
     run("--out", str(tmp_path), "--only", "threads,radius")
-    every = tuple(run_module.EXPERIMENTS)
     assert asked == [
-        (settings_module.Settings(), every),
-        (settings_module.quick(("coins", "photo")), every),
-        (settings_module.Settings(), ("threads", "radius")),
+        (Settings(), {}),
+        (Settings.quick(scenes=("coins", "photo")), {}),
+        (Settings(), {"only": ("threads", "radius")}),
     ]
 
 
@@ -76,14 +88,12 @@ def test_bad_input_is_named(flags, message, tmp_path, monkeypatch):
         run(*flags)
 
 
-def test_stability_is_a_chapter_of_its_own(tmp_path, monkeypatch, capsys):
-    asked = []
-    monkeypatch.setattr("torchbokeh.report.stability.run_stability", lambda settings, say: asked.append(settings))
-    monkeypatch.setattr("torchbokeh.report.stability.write.write_stability", lambda found, folder: [folder / "a.md"])
+def test_stability_is_a_chapter_of_its_own(tmp_path, asked, capsys):
     run("--stability", "--out", str(tmp_path))
     run("--stability", "--quick", "--out", str(tmp_path))
-    assert asked == [StabilitySettings(), QUICK]
-    assert capsys.readouterr().out.split() == [str(tmp_path / "a.md")] * 2
+    assert asked == [(StabilitySettings(), {}), (StabilitySettings.quick(), {})]
+    files = [str(tmp_path / f"stability.{ending}") for ending in ("md", "json")]
+    assert capsys.readouterr().out.split() == files * 2
     with pytest.raises(ValueError, match="--stability: expected no --scenes"):
         run("--stability", "--scenes", "photo", "--out", str(tmp_path))
 

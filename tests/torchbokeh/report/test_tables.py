@@ -1,20 +1,6 @@
 import re
 
-import pytest
-
-from torchbokeh.report.markdown import seconds, table
 from torchbokeh.report.tables import markdown
-
-
-def test_a_table_is_markdown():
-    assert table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(123.4, "123.4"), (9.876, "9.88"), (0.5, "0.500"), (0.001234, "0.00123"), (1e-5, "1.00e-05")]
-)
-def test_seconds_have_three_digits(value, text):
-    assert seconds(value) == text
 
 
 def test_a_report_has_every_section_and_whole_tables(report):

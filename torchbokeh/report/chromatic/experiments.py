@@ -13,10 +13,12 @@ from torch import Tensor
 import torchbokeh
 from torchbokeh.ops.sampling import halton
 from torchbokeh.ops.spectrum import spectral_samples
+from torchbokeh.report.experiment import Experiment, Figures
+from torchbokeh.report.markdown import pictures, row_table, seconds, section, table
 from torchbokeh.report.measure import Work, errors, measure
-from torchbokeh.report.scenes import still
+from torchbokeh.report.rows import Row, Say, distinct, of
+from torchbokeh.report.scenes import still, with_dispersion
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
 from torchbokeh.scenes import Camera, Scene
 
 SPECTRA = ("rgb", "continuous")
@@ -36,7 +38,7 @@ PEAK, WIDTH, SAMPLES = 480.0, 20.0, 64
 def dispersing(camera: Camera, spectrum: str, axial: float, lateral: float) -> Camera:
     """The same camera with a lens of BK7 that disperses."""
     dispersion = torchbokeh.Dispersion("BK7", axial, lateral, spectrum=spectrum)  # type: ignore[arg-type]
-    return replace(camera, lens=torchbokeh.ThinLens(**camera.lens.values(), dispersion=dispersion))
+    return with_dispersion(camera, dispersion)
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,8 @@ def chromatic_truth(settings: Settings, say: Say) -> list[Row]:
 
     The truth is the mean of two halves, each ``ChromaticAccumulation`` with a seed of its own; few views take a third.
     The row with the method ``truth`` compares the halves. Of a continuous spectrum only the last strengths are taken.
-    Errors leave out a
-    border as wide as the largest radius, the spread of colours and 2 px. ``times_equal``, of LensBlur, says how many
-    times longer the accumulation takes to come as near by SSIM; see `times_equal`.
+    Errors leave out a border as wide as the largest radius, the spread of colours and 2 px. ``times_equal``, of
+    LensBlur, says how many times longer the accumulation takes to come as near by SSIM; see `times_equal`.
     """
     rows: list[Row] = []
     for work in _Case.of(replace(settings, chromatic_size=48), "coins", "rgb", (0.5, 0.03)).works((3,)).values():
@@ -107,11 +108,11 @@ def _truth_rows(case: _Case, settings: Settings) -> list[Row]:
     return rows
 
 
-def times_equal(seconds: float, error: float, line: Sequence[tuple[float, float]]) -> tuple[float, str]:
+def times_equal(taken: float, error: float, line: Sequence[tuple[float, float]]) -> tuple[float, str]:
     """How many times longer another method takes to come to the same error, and how that is bounded.
 
     Args:
-        seconds: of this method.
+        taken: seconds of this method.
         error: of this method.
         line: seconds and errors of the other, the fewest seconds first; straight in between on logarithmic axes.
 
@@ -124,12 +125,12 @@ def times_equal(seconds: float, error: float, line: Sequence[tuple[float, float]
         (4.0, '')
     """
     if line[0][1] <= error:
-        return line[0][0] / seconds, "<"
+        return line[0][0] / taken, "<"
     for (start, high), (end, low) in pairwise(line):
         if low <= error:
             share = math.log(high / max(error, 1e-12)) / math.log(high / max(low, 1e-12))
-            return start * (end / start) ** share / seconds, ""
-    return line[-1][0] / seconds, ">"
+            return start * (end / start) ** share / taken, ""
+    return line[-1][0] / taken, ">"
 
 
 def chromatic_samples(settings: Settings, say: Say) -> list[Row]:
@@ -251,3 +252,79 @@ def importance(settings: Settings, say: Say) -> list[Row]:
     head = {"samples": SAMPLES, "seeds": settings.importance_seeds, "peak": PEAK, "width": WIDTH}
     head |= {"variance": float(found.mean()), "variance_without": float(without.mean())}
     return [{**head, "ratio": float(without.mean() / found.mean())} | {f"ratio_{c}": value for c, value in channels}]
+
+
+def _truth_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    size = settings["chromatic_size"]
+    about = (
+        f"{size} x {size}, radius up to {settings['chromatic_radius']:g} px, BK7. The truth is ChromaticAccumulation "
+        f"of {settings['chromatic_truth']} views; the row *truth* compares its two halves, which have more noise than "
+        "their mean. A border as wide as the largest radius, the spread of colours and 2 px is left out. *Times equal* "
+        "is how many times longer the accumulation takes to come as near by SSIM; > where it does not with the views "
+        "tried: then that is the ratio to the most views; < where it does so with the fewest. Medians of up to "
+        f"{settings['chromatic_repeat']} runs."
+    )
+    rows = [
+        {**row, "equal": f"{row['bound']} {row['times_equal']:.2g}".strip()} if "bound" in row else row for row in rows
+    ]
+    header = "scene | spectrum | axial | lateral | spread | method |  | seconds | SSIM | PSNR | L1 | times equal"
+    cells = "{scene} | {spectrum} | {axial:g} | {lateral:g} | {spread:.1f} | {method} | {setting} | {seconds:t} | "
+    cells += "{ssim:.4f} | {psnr:.1f} | {l1:.4f} | {equal}"
+    return section("Dispersion against the truth", about, *pictures(plots, "chromatic"), row_table(rows, header, cells))
+
+
+def _truth_figures(rows: list[Row]) -> Figures:
+    from torchbokeh.report.figures import against_truth
+
+    names = [name for name in distinct(rows, "method") if name != "truth"]
+    colours = dict(zip(names, ("#9467bd", "#d62728", "#1f77b4"), strict=True))
+    title = "With dispersion, mean over scenes, spectra and strengths"
+    return {"chromatic.png": against_truth(rows, "method", "setting", "ssim", colours, title)}
+
+
+def _samples(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    lines = []
+    for spectrum in distinct(rows, "spectrum"):
+        chosen = of(rows, spectrum=spectrum)
+        line = [f"{1000 * chosen[0][key]:.3g}" for key in ("per_view", "fixed")]
+        lines.append([spectrum, *(seconds(row["seconds"]) for row in chosen), *line, f"{chosen[0]['r2']:.4f}"])
+    size = f"{rows[0]['size']} x {rows[0]['size']}"
+    return section(
+        "Dispersion: run time against views",
+        f"{rows[0]['scene']}, {size}, axial and lateral aberration: seconds of ChromaticAccumulation by views, the "
+        "form of table 4.1 of the dissertation. The last columns are those of a straight line through them: "
+        "milliseconds per view and of none, and the share of the variance that it explains.",
+        table(["spectrum", *map(str, distinct(rows, "views")), "ms per view", "ms fixed", "R2"], lines),
+    )
+
+
+def _bands(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    thousandths = [{**row, "banding": 1000 * row["banding"]} for row in rows]
+    return section(
+        "Dispersion: bands of colour",
+        f"A bright dot, blurred by {rows[0]['radius']:g} px in red light and {1.5 * rows[0]['radius']:g} px in blue. "
+        "Banding is the energy of quick changes of its chromaticity (R - B) / (R + G + B) along the radius, those "
+        "of periods below 8 px, in thousandths of that of slow ones. Noise of few views counts as well.",
+        row_table(thousandths, "method | spectrum | banding", "{method} | {spectrum} | {banding:.3g}"),
+    )
+
+
+def _importance(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    row = rows[0]
+    header = "without | with | ratio | red | green | blue"
+    cells = (
+        "{variance_without:.3g} | {variance:.3g} | {ratio:.3g} | {ratio_red:.3g} | {ratio_green:.3g} | {ratio_blue:.3g}"
+    )
+    return section(
+        "Dispersion: importance sampling",
+        f"A blurred dot from {row['samples']} samples of the spectrum under an equaliser that is a Gaussian about "
+        f"{row['peak']:g} nm with a standard deviation of {row['width']:g} nm. Variance over {row['seeds']} seeds, "
+        "the mean over pixels and channels, without importance and with it; their ratio, also of each channel.",
+        row_table(rows, header, cells),
+    )
+
+
+DISPERSION_TRUTH = Experiment("chromatic_truth", chromatic_truth, _truth_section, _truth_figures)
+DISPERSION_VIEWS = Experiment("chromatic_samples", chromatic_samples, _samples)
+DISPERSION_BANDS = Experiment("chromatic_bands", chromatic_bands, _bands)
+DISPERSION_IMPORTANCE = Experiment("importance", importance, _importance)

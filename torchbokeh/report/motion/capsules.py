@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchbokeh import Samples, pinhole_position
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.system.threads import run_all
-from torchbokeh.renderers.reconstruction import Samples, pinhole_position, pixel_positions
+from torchbokeh.report.internals import pixel_positions
 
 FINE, THIN = 3, 4.0
 """A disc of a smaller radius than ``THIN`` px is sampled at ``FINE**2`` places of each pixel."""

@@ -1,6 +1,6 @@
 """Defocus with motion: splats from the bank beside a dense scatter of every capsule, and the tables of LKS."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,17 +9,16 @@ import torch
 from torch import Tensor
 
 import torchbokeh
-from torchbokeh.banks.splat import bank_of_motion, splat_bank
-from torchbokeh.compose.surfaces import bin_centres
 from torchbokeh.ops.composite import bin_weights
 from torchbokeh.ops.dispatch import numba_is_there
-from torchbokeh.psfs import PsfBank
 from torchbokeh.psfs.model import Labels
+from torchbokeh.report.experiment import Experiment
+from torchbokeh.report.internals import QUALITY_NAMES, bank_of_motion, bin_centres, splat_bank
+from torchbokeh.report.markdown import row_table, section
 from torchbokeh.report.measure import Work, displayed, errors, measure
+from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
-from torchbokeh.report.speed.methods import QUALITIES
 from torchbokeh.scenes import RECIPES, samples
 
 DENSE = "dense scatter of capsules"
@@ -59,13 +58,13 @@ def with_motion(settings: Settings, say: Say) -> list[Row]:
         return []
     from torchbokeh.report.motion.capsules import dense_capsules
 
-    bank = PsfBank.load("combined")
+    bank = torchbokeh.PsfBank.load("combined")
     rows: list[Row] = []
     for radius, longest in settings.motions:
         say(f"defocus with motion: radius {radius:g} px, motion {longest:g} px")
         seen, motion = photo(settings.motion_size, radius), spinning(settings.motion_size, longest)
         works: dict[str, Work] = {DENSE: partial(dense_capsules, seen.image, seen.coc, motion)}
-        for quality in QUALITIES:
+        for quality in QUALITY_NAMES:
             for interpolate in (False, True) if quality == "exact" else (False,):
                 name = f"bank, {quality}" + (", interpolated" if interpolate else "")
                 blur = torchbokeh.KernelSplatting(bank=bank, quality=quality, interpolate=interpolate)
@@ -153,10 +152,7 @@ def _reconstruction(scene: _Scene) -> dict[str, Work]:
     return works
 
 
-KINDS: dict[str, Callable[[_Scene], dict[str, Work]]] = {
-    "synthesis": _synthesis,
-    "reconstruction": _reconstruction,
-}
+KINDS: dict[str, Callable[[_Scene], dict[str, Work]]] = {"synthesis": _synthesis, "reconstruction": _reconstruction}
 
 
 def like_lks(
@@ -202,3 +198,42 @@ def non_local_means(image: Tensor, truth: Tensor) -> Tensor:
     tried = (denoise_nl_means(shown, patch_size=5, h=h, channel_axis=2) for h in STRENGTHS)
     linear = [torch.from_numpy(np.clip(t, 0, 1) ** 2.2).permute(2, 0, 1)[None] for t in tried]
     return max(linear, key=lambda t: float(errors(t, truth, flip=False)["ssim"] or 0))
+
+
+HEADER = "method | seconds | times dense | SSIM | PSNR | L1"
+CELLS = "{method} | {seconds:t} | {times_dense:.1f} | {ssim:.4f} | {psnr:.1f} | {l1:.4f}"
+"""The last columns of both tables."""
+
+
+def _motion_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    about = (
+        f"photo, {rows[0]['size']} x {rows[0]['size']}, turning; up to so many px of radius and motion; errors against "
+        "the dense scatter."
+    )
+    return section(
+        "Defocus with motion",
+        about,
+        row_table(rows, f"radius | motion | {HEADER}", "{radius:g} | {longest:g} | " + CELLS),
+    )
+
+
+def like_lks_table(rows: list[Row]) -> str:
+    """The rows of `like_lks` as a Markdown table."""
+    return row_table(rows, f"scene | kind | {HEADER}", "{scene} | {kind} | " + CELLS)
+
+
+def _like_lks_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    size = settings["truth_size"]
+    about = (
+        f"Tables 2 and 3 of LKS with recipes of this package, {size} x {size}, radius up to "
+        f"{settings['truth_radius']:g} px: synthesis from the pinhole picture or its layers, and reconstruction from "
+        f"one sample per pixel; the truth is an accumulation buffer of {2 * settings['truth_views']} views. Times are "
+        "beside the dense scatter of the same input: picture, layers or samples. Re-weighted: layers over one "
+        "another, as LKS composes them after Lee et al. (2008). The time of non-local means is that of five "
+        "strengths, of which the best one counts."
+    )
+    return section("Synthesis and reconstruction", about, like_lks_table(rows))
+
+
+MOTION = Experiment("motion", with_motion, _motion_section)
+LIKE_LKS = Experiment("like_lks", like_lks, _like_lks_section)

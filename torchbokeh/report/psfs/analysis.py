@@ -4,10 +4,10 @@ A PSF here is a capsule of `torchbokeh.psfs.combined.Combined` unless something 
 of points, or of squares of a quad tree, over the pixels that the dense PSF covers.
 """
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,11 @@ from torchbokeh.psfs.refit import Fit, Sparse, reconstruction, reflections
 from torchbokeh.psfs.represent import Target, candidates, laplacian, represent
 from torchbokeh.psfs.similarity import Score, centred, neighbourhood, score
 from torchbokeh.psfs.sparsify import NOISE, ablation, sparsify, voronoi_sums
-from torchbokeh.report.machine import machine
-from torchbokeh.report.psfs.splats import coordinates, far_field, rotation, sample_count
+from torchbokeh.report.psfs.splats import coordinates
+from torchbokeh.report.rows import Row, Say
+from torchbokeh.report.settings import Sizes, sized
 
 Array = NDArray[np.float64]
-Say = Callable[[str], None]
-Row = dict[str, Any]
 
 SPARSITY = 0.093
 """Mean sparsity of LKS's `Combined`."""
@@ -40,9 +39,12 @@ STEPS = {"darts": 1.0, "relaxation": 0.967, "annealing": 0.871, "both": 0.865}
 
 SEED = 0
 
+THICK = 4
+"""Radius in px from which on a PSF is not thin."""
+
 
 @dataclass(frozen=True)
-class Settings:
+class PsfSettings(Sizes):
     """How large an analysis is.
 
     Attributes:
@@ -62,85 +64,27 @@ class Settings:
         reach: of the largest sample that is turned, in px.
     """
 
-    psfs: int = 32
-    support: tuple[int, int] = (100, 25_000)
-    ablated: int = 12
-    sizes: tuple[tuple[float, float, float, float], ...] = (
-        (25, 25, 50, 50),
-        (50, 40, 50, 128),
-        (100, 55, 100, 128),
+    psfs: int = sized(32, 3)
+    support: tuple[int, int] = sized((100, 25_000), (100, 1000))
+    ablated: int = sized(12, 1)
+    sizes: tuple[tuple[float, float, float, float], ...] = sized(
+        ((25, 25, 50, 50), (50, 40, 50, 128), (100, 55, 100, 128)), ((6, 3, 6, 10),)
     )
-    shares: int = 13
-    large: tuple[tuple[float, float], ...] = (
-        *((25, 50), (25, 128), (50, 50), (50, 128)),
-        *((50, 256), (100, 50), (100, 128), (100, 256)),
+    shares: int = sized(13, 5)
+    large: tuple[tuple[float, float], ...] = sized(
+        ((25, 50), (25, 128), (50, 50), (50, 128), (50, 256), (100, 50), (100, 128), (100, 256)), ((12, 20),)
     )
-    cells: tuple[int, ...] = (CELLS // 8, CELLS // 4, CELLS // 2, CELLS)
-    coordinates: int = 200
-    far: int = 60
-    turned: int = 16
-    angles: int = 7
-    splats: int = 200
-    reach: int = 40
-
-    def row(self) -> Row:
-        """Everything, for the record."""
-        return asdict(self)
+    cells: tuple[int, ...] = sized((CELLS // 8, CELLS // 4, CELLS // 2, CELLS), (10, 20))
+    coordinates: int = sized(200, 3)
+    far: int = sized(60, 4)
+    turned: int = sized(16, 2)
+    angles: int = sized(7, 3)
+    splats: int = sized(200, 10)
+    reach: int = sized(40, 12)
 
 
-def quick() -> Settings:
-    """Small enough for a test: it shows that everything runs, its numbers mean little."""
-    return Settings(
-        psfs=3,
-        support=(100, 1000),
-        ablated=1,
-        sizes=((6, 3, 6, 10),),
-        shares=5,
-        large=((12, 20),),
-        cells=(10, 20),
-        coordinates=3,
-        far=4,
-        turned=2,
-        angles=3,
-        splats=10,
-        reach=12,
-    )
-
-
-def analyse(settings: Settings, say: Say) -> dict[str, Any]:
-    """Run all experiments.
-
-    Args:
-        settings: how much of each.
-        say: is told in a line what comes next.
-
-    Returns:
-        What goes into ``psfs.json``: ``machine``, ``settings``, ``experiments`` with the rows of each, and ``seconds``,
-        how long it all took.
-    """
-    start = time.perf_counter()
-    psfs = list(random_psfs(settings.psfs, settings.support))
-    experiments: dict[str, list[Row]] = {
-        "equal": equal_sparsity(psfs, say),
-        "needed": needed(psfs, say),
-        "sizes": sizes(settings, say),
-        "samples": sample_count(settings.coordinates, settings.cells, say),
-        "ablation": steps(psfs[: settings.ablated], say),
-        "large": large(settings, say),
-        "far": far_field(settings.far, say),
-    }
-    experiments["rotation"], experiments["sum"] = rotation(
-        settings.turned, settings.angles, settings.splats, settings.reach, say
-    )
-    return {
-        "machine": machine(),
-        "settings": settings.row(),
-        "experiments": experiments,
-        "seconds": time.perf_counter() - start,
-    }
-
-
-def random_psfs(count: int, support: tuple[int, int]) -> Iterator[Array]:
+@lru_cache(maxsize=1)
+def random_psfs(count: int, support: tuple[int, int]) -> tuple[Array, ...]:
     """PSFs of `Combined` ``(1, h, w)`` at random coordinates, of those that cover neither fewer nor more pixels.
 
     Example:
@@ -148,12 +92,8 @@ def random_psfs(count: int, support: tuple[int, int]) -> Iterator[Array]:
         [True, True]
     """
     model = Combined()
-    draw = coordinates(model)
-    while count:
-        psf = model.dense(next(draw))
-        if support[0] <= covers(psf) <= support[1]:
-            count -= 1
-            yield psf
+    fitting = (psf for psf in map(model.dense, coordinates(model)) if support[0] <= covers(psf) <= support[1])
+    return tuple(islice(fitting, count))
 
 
 def covers(psf: Array) -> int:
@@ -249,7 +189,7 @@ def gaussian(sigma: float) -> Array:
     return picture / picture.sum()
 
 
-def sizes(settings: Settings, say: Say) -> list[Row]:
+def sizes(settings: PsfSettings, say: Say) -> list[Row]:
     """Similarity against sparsity, for discs, Gaussians and capsules of several sizes."""
     rows = []
     for radius, sigma, wide, length in settings.sizes:
@@ -277,7 +217,7 @@ def steps(psfs: Sequence[Array], say: Say) -> list[Row]:
     return [{"step": name, "here": found[name], "LKS": published} for name, published in STEPS.items()]
 
 
-def large(settings: Settings, say: Say) -> list[Row]:
+def large(settings: PsfSettings, say: Say) -> list[Row]:
     """The sparsity at which large capsules reach a similarity of 0.99, near (``ssim``) and in the frame; None if
     no set of the candidates does. ``best`` is the similarity near of all of them.
     """

@@ -1,19 +1,16 @@
 """The pictures of an analysis of sparse PSFs."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
-from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY
-from torchbokeh.report.psfs.tables import THICK, mean, of
-
-Row = dict[str, Any]
+from torchbokeh.report.experiment import Figures
+from torchbokeh.report.figures import legend, one_panel, per_cent, plain_errors
+from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY, THICK
+from torchbokeh.report.rows import Row, distinct, mean, of
 
 COLOURS = dict(zip(METHODS, ("#d62728", "#f0a08c", "#1f77b4", "#7f7f7f"), strict=True))
 SHADES = ("#f6a58c", "#d62728", "#7a0c0c")
@@ -24,26 +21,8 @@ PUBLISHED = {"LKS": (SPARSITY, 0.97), "quad tree": (SPARSITY, 0.89)}
 """Sparsity and similarity of LKS figure 10 a."""
 
 
-def draw(rows: dict[str, list[Row]]) -> dict[str, Figure]:
-    """All plots of an analysis.
-
-    Args:
-        rows: the ``experiments`` that `torchbokeh.report.psfs.analysis.analyse` returns.
-
-    Returns:
-        Figures by the names of their files.
-    """
-    return {
-        "psfs_equal.png": _equal(rows["equal"]),
-        "psfs_similarity.png": _similarity(of(rows["equal"], share=SPARSITY)),
-        "psfs_needed.png": _needed(rows["needed"]),
-        "psfs_sizes.png": _sizes(rows["sizes"]),
-        "psfs_samples.png": _samples(rows["samples"]),
-        "psfs_rotation.png": _rotation(rows["rotation"]),
-    }
-
-
-def _equal(rows: list[Row]) -> Figure:
+def equal(rows: list[Row]) -> Figures:
+    """Similarity against sparsity, a line for each method; and how often a similarity occurs."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     thick = [row for row in rows if row["radius"] >= THICK]
     panels = [("near", "ssim", rows), (f"near, r >= {THICK} px", "ssim", thick), ("in the frame", "ssim_frame", rows)]
@@ -55,11 +34,11 @@ def _equal(rows: list[Row]) -> Figure:
         for method, place in PUBLISHED.items():
             axes.plot(*place, "*", color=COLOURS[method], markersize=10, label=f"{method}, published", linestyle="")
         axes.set(xscale="log", xlabel="mean sparsity", title=title)
-        _per_cent(axes, SHARES)
+        per_cent(axes, SHARES)
         axes.grid(alpha=0.25)
     figure.axes[0].set_ylabel("mean SSIM")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
-    return figure
+    legend(figure, *axes.get_legend_handles_labels())
+    return {"psfs_equal.png": figure, "psfs_similarity.png": _similarity(of(rows, share=SPARSITY))}
 
 
 def _similarity(rows: list[Row]) -> Figure:
@@ -76,7 +55,7 @@ def _similarity(rows: list[Row]) -> Figure:
     return figure
 
 
-def _needed(rows: list[Row]) -> Figure:
+def needed(rows: list[Row]) -> Figures:
     """How often a sparsity occurs, a panel for each method."""
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     least = min(row[method] for row in rows for method in ("ours", "quad tree"))
@@ -86,32 +65,33 @@ def _needed(rows: list[Row]) -> Figure:
         axes.hist(np.minimum([row[method] for row in rows], 1.0), bins, color=COLOURS[method])
         _mean_line(axes, method, mean(rows, method), ".0%")
         axes.set(xscale="log", xlabel="sparsity")
-        _per_cent(axes, [tick for tick in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0) if tick > least / 2])
+        per_cent(axes, [tick for tick in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0) if tick > least / 2])
     grid[0].set_ylabel("PSFs")
     figure.suptitle("of the same L1 error", fontsize=10)
-    return figure
+    return {"psfs_needed.png": figure}
 
 
-def _sizes(rows: list[Row]) -> Figure:
+def sizes(rows: list[Row]) -> Figures:
+    """Error against sparsity, a panel for each kind."""
     figure = Figure(figsize=(10, 3.6), layout="constrained")
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    kinds = distinct(rows, "kind")
     for axes, kind in zip(figure.subplots(1, len(kinds), sharex=True, sharey=True), kinds, strict=True):
-        for name, colour in zip(dict.fromkeys(row["name"] for row in of(rows, kind=kind)), SHADES, strict=False):
+        for name, colour in zip(distinct(of(rows, kind=kind), "name"), SHADES, strict=False):
             chosen = of(rows, kind=kind, name=name)
             errors = [max(1 - row["ssim"], LEAST) for row in chosen]
             axes.plot([row["sparsity"] for row in chosen], errors, "o-", color=colour, label=name, markersize=3)
         axes.set(xscale="log", yscale="log", xlabel="sparsity", title=kind)
-        _per_cent(axes, (0.001, 0.01, 0.1))
+        per_cent(axes, (0.001, 0.01, 0.1))
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8, loc="lower left")
         axes.label_outer()
     figure.axes[0].set_ylabel("1 - SSIM near")
-    return figure
+    return {"psfs_sizes.png": figure}
 
 
-def _samples(rows: list[Row]) -> Figure:
-    figure = Figure(figsize=(6, 3.6), layout="constrained")
-    axes = figure.subplots()
+def samples(rows: list[Row]) -> Figures:
+    """Similarity against the number of samples."""
+    figure, axes = one_panel(6, 3.6)
     ways = {"middle": "middle of the box", "prefiltered": "pre-filtered over the box", "linear": "linear interpolation"}
     for (way, name), colour in zip(ways.items(), ("#7f7f7f", "#d62728", "#1f77b4"), strict=True):
         axes.plot([row["samples"] for row in rows], [row[way] for row in rows], "o-", color=colour, label=name)
@@ -120,13 +100,12 @@ def _samples(rows: list[Row]) -> Figure:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=9)
-    return figure
+    return {"psfs_samples.png": figure}
 
 
-def _rotation(rows: list[Row]) -> Figure:
+def rotation(rows: list[Row]) -> Figures:
     """A line for each sample, in the colour of its radius."""
-    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = one_panel(6.5, 3.8)
     radii = [row["radius"] for row in rows]
     colours = ScalarMappable(LogNorm(min(radii), max(radii)), "viridis_r")
     for radius, length in dict.fromkeys((row["radius"], row["length"]) for row in rows):
@@ -134,10 +113,10 @@ def _rotation(rows: list[Row]) -> Figure:
         axes.plot([row["degrees"] for row in chosen], [row["l1"] for row in chosen], color=colours.to_rgba(radius))
     axes.set(xlabel="angle in degrees", ylabel="relative L1 error", ylim=(0, None))
     axes.set_xticks(range(0, 46, 15))
-    bar = figure.colorbar(colours, ax=axes, label="radius in px", format=FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.ax.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else ""))
+    bar = figure.colorbar(colours, ax=axes, label="radius in px")
+    plain_errors(bar.ax.yaxis)
     axes.grid(alpha=0.25)
-    return figure
+    return {"psfs_rotation.png": figure}
 
 
 def _mean_line(axes: Axes, name: str, value: float, form: str) -> None:
@@ -145,8 +124,3 @@ def _mean_line(axes: Axes, name: str, value: float, form: str) -> None:
     axes.axvline(value, color="0.2", linewidth=1, linestyle="--")
     axes.set_title(f"{name}, mean {value:{form}}", fontsize=10)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _per_cent(axes: Axes, ticks: Sequence[float]) -> None:
-    axes.set_xticks(ticks, [f"{100 * tick:.3g} %" for tick in ticks])
-    axes.xaxis.set_minor_locator(NullLocator())

@@ -1,9 +1,10 @@
 """What samples are worth: how near the next one is, how far it is seen, and how well it turns."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,10 +20,9 @@ from torchbokeh.psfs.model import PsfModel, mean_picture
 from torchbokeh.psfs.refit import Sparse, reconstruction
 from torchbokeh.psfs.represent import DOMAINS
 from torchbokeh.psfs.similarity import NEAR, centred, neighbourhood, score
+from torchbokeh.report.rows import Row, Say
 
 Array = NDArray[np.float64]
-Say = Callable[[str], None]
-Row = dict[str, Any]
 
 FACTORS = (1.0, 1.5, 2.0, 4.0)
 """Distances of the far field, in half sides of the neighbourhood: the PSF and `NEAR` px around it."""
@@ -164,33 +164,37 @@ class Sample(NamedTuple):
     fine: Array
 
 
-def rotation(count: int, angles: int, splats: int, reach: int, say: Say) -> tuple[list[Row], list[Row]]:
+@lru_cache(maxsize=1)
+def random_samples(count: int, reach: int) -> tuple[Sample, ...]:
+    """Laplacian samples of the bank of `Combined`, drawn at random, that reach no farther than so many px."""
+    bank = PsfBank.load("combined")
+    samples = laplacian_samples(bank)
+    samples = samples[bank.reach().numpy()[samples] <= reach]
+    draw = np.random.default_rng(SEED)
+    return tuple(sample_of(bank.model, int(k)) for k in draw.choice(samples, count, replace=False))
+
+
+def rotation(count: int, angles: int, reach: int, say: Say) -> list[Row]:
     """Turn samples of the bank of `Combined` as a renderer does, and compare them with turned dense PSFs.
 
     Args:
         count: samples, drawn at random.
         angles: how many angles from 0 to 45 degrees; symmetry does the others.
-        splats: how many random splats are summed.
         reach: of the largest sample, in px.
         say: is told in a line what comes next.
 
     Returns:
-        For each sample and angle, the relative L1 error; and the row of `many`.
+        For each sample and angle, the relative L1 error.
     """
     bank = PsfBank.load("combined")
-    samples = laplacian_samples(bank)
-    samples = samples[bank.reach().numpy()[samples] <= reach]
-    draw = np.random.default_rng(SEED)
-    chosen = [sample_of(bank.model, int(k)) for k in draw.choice(samples, count, replace=False)]
     rows: list[Row] = []
-    for sample in sorted(chosen, key=lambda sample: sample.radius):
+    for sample in sorted(random_samples(count, reach), key=lambda sample: sample.radius):
         where = {"radius": sample.radius, "length": sample.length}
         say(f"rotation: a sample of r = {sample.radius:.1f} px, l = {sample.length:.1f} px")
         for angle in np.linspace(0, math.pi / 4, angles).tolist():
             error = relative(*both(bank, sample, angle, half_of(reach)))
             rows.append({**where, "degrees": math.degrees(angle), "l1": error})
-    say(f"rotation: the sum of {splats} splats")
-    return rows, [many(bank, chosen, splats, reach)]
+    return rows
 
 
 def sample_of(model: PsfModel, number: int) -> Sample:
@@ -245,7 +249,7 @@ def relative(splatted: Array, dense: Array) -> float:
     return float(np.abs(splatted - dense).sum() / dense.sum())
 
 
-def many(bank: PsfBank, chosen: list[Sample], splats: int, reach: int) -> Row:
+def many(bank: PsfBank, chosen: Sequence[Sample], splats: int, reach: int) -> Row:
     """The sum of splats at random places, of random colours and rotations, in a square of twice the reach.
 
     Returns:
@@ -262,7 +266,7 @@ def many(bank: PsfBank, chosen: list[Sample], splats: int, reach: int) -> Row:
     squares, errors = np.zeros_like(dense), []
     for place in places:
         y, x = divmod(int(place), side)
-        sample, angle = chosen[draw.integers(len(chosen))], draw.uniform(0, math.pi)
+        sample, angle = chosen[int(draw.integers(len(chosen)))], draw.uniform(0, math.pi)
         colour = draw.random(3)
         values[0, :, y, x], index[0, 0, y, x], angles[y, x] = torch.from_numpy(colour), sample.number, angle
         splatted, truth = both(bank, sample, angle, half)

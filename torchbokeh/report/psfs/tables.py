@@ -1,88 +1,31 @@
 """``psfs.md``: the tables of an analysis of sparse PSFs, and what a reader has to know about them."""
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from torchbokeh.report.markdown import table
-from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY
-
-Row = dict[str, Any]
-
-THICK = 4
-"""Radius in px from which on a PSF is not thin."""
+from torchbokeh.report.markdown import row_table, section, table
+from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY, THICK
+from torchbokeh.report.rows import Row, distinct, mean, of
 
 
-def write_analysis(found: dict[str, Any], folder: Path) -> list[Path]:
-    """Write ``psfs.md``, ``psfs.json`` and plots, all of them or none.
-
-    Args:
-        found: what `torchbokeh.report.psfs.analysis.analyse` returns.
-        folder: an existing folder; files of an earlier analysis are replaced.
-
-    Returns:
-        The files written, ``psfs.md`` first.
-    """
-    from torchbokeh.report.psfs.plots import draw
-    from torchbokeh.report.write import write_together
-
-    return write_together(folder, "psfs", markdown(found), found, draw(found["experiments"]))
-
-
-def markdown(found: dict[str, Any]) -> str:
-    """The whole analysis, in Markdown; its pictures are those of `torchbokeh.report.psfs.plots.draw`."""
-    rows, settings = found["experiments"], found["settings"]
-    sections = [
-        _head(found),
-        _equal(rows["equal"], settings),
-        _needed(rows["needed"]),
-        _sizes(),
-        _samples(rows["samples"], settings),
-        _ablation(rows["ablation"], settings),
-        _large(rows["large"]),
-        _far(rows["far"], settings),
-        _rotation(rows["rotation"], rows["sum"][0]),
-    ]
-    return "\n\n".join(sections) + "\n"
-
-
-def mean(rows: Iterable[Row], key: str) -> float:
-    """The mean of a column.
-
-    Example:
-        >>> mean([{"l1": 1.0}, {"l1": 2.0}], "l1")
-        1.5
-    """
-    return float(np.mean([row[key] for row in rows]))
-
-
-def of(rows: Iterable[Row], **wanted: Any) -> list[Row]:
-    """The rows that have all these values."""
-    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
-
-
-def _section(title: str, *parts: str) -> str:
-    return "\n\n".join([f"## {title}", *parts])
-
-
-def _head(found: dict[str, Any]) -> str:
+def head(found: dict[str, Any]) -> str:
+    """What the analysis is, and on which machine it ran."""
     made = found["machine"]
-    return "\n\n".join(
-        [
-            "# Sparse PSFs",
-            "The analysis of Leimkühler et al. 2018 (LKS), section 7.3 and figure 10, with the PSFs of this package.",
-            f"{made['processor']}, {made['threads']} threads, torch {made['torch']}, numpy {made['numpy']}. It took "
-            f"{found['seconds'] / 60:.1f} minutes. All numbers are in `psfs.json`.",
-            "*Sparsity* is the number of points, or of squares of the quad tree, over the pixels that the dense PSF "
-            "covers. *SSIM near* is taken in the PSF and 8 px around it, *in the frame* in 513 x 513 px as in LKS, "
-            "where what is empty counts as right. L1 is the sum of absolute differences over the sum of the PSF.",
-        ]
+    return (
+        "# Sparse PSFs\n\n"
+        "The analysis of Leimkühler et al. 2018 (LKS), section 7.3 and figure 10, with the PSFs of this package.\n\n"
+        f"{made['processor']}, {made['threads']} threads, torch {made['torch']}, numpy {made['numpy']}. It took "
+        f"{found['seconds'] / 60:.1f} minutes. All numbers are in `psfs.json`.\n\n"
+        "*Sparsity* is the number of points, or of squares of the quad tree, over the pixels that the dense PSF "
+        "covers. *SSIM near* is taken in the PSF and 8 px around it, *in the frame* in 513 x 513 px as in LKS, "
+        "where what is empty counts as right. L1 is the sum of absolute differences over the sum of the PSF."
     )
 
 
-def _equal(rows: list[Row], settings: Row) -> str:
+def equal(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """Similarity of every method at equal sparsity."""
     fewest, most = settings["support"]
     parts = [
         f"{settings['psfs']} capsules at random coordinates of the grid of `combined`, those that cover {fewest} to "
@@ -93,81 +36,67 @@ def _equal(rows: list[Row], settings: Row) -> str:
         "PSF to PSF, and it is not said which pixels the SSIM is of. Thin PSFs are lines along x here, which suits the "
         "quad tree; it cannot be turned.",
         "![similarity against sparsity](psfs_equal.png)",
-        table(
-            [
-                "asked",
-                "method",
-                "sparsity %",
-                "SSIM near",
-                f"of r >= {THICK} px",
-                "SSIM in the frame",
-                "L1",
-                "efficiency",
-            ],
-            [_equal_row(share, method, of(rows, share=share, method=method)) for share in SHARES for method in METHODS],
+        row_table(
+            [_equal_row(of(rows, share=share, method=method)) for share in SHARES for method in METHODS],
+            f"asked | method | sparsity % | SSIM near | of r >= {THICK} px | SSIM in the frame | L1 | efficiency",
+            "{share:.1%} | {method} | {sparsity:.2f} | {ssim:.3f} | {thick:.3f} | {ssim_frame:.4f} | {l1:.3f} | "
+            "{near:.2f} / {frame:.2f}",
         ),
         "![distribution of similarity](psfs_similarity.png)",
     ]
-    return _section("Equal sparsity", *parts)
+    return section("Equal sparsity", *parts)
 
 
-def _equal_row(share: float, method: str, rows: list[Row]) -> list[str]:
+def _equal_row(rows: list[Row]) -> Row:
+    """The means of one method at one sparsity."""
     thick = [row for row in rows if row["radius"] >= THICK]
-    sparsity, frame = mean(rows, "sparsity"), mean(rows, "ssim_frame")
-    near = [f"{mean(chosen, 'ssim'):.3f}" if chosen else "-" for chosen in (rows, thick)]
-    errors = [
-        f"{frame:.4f}",
-        f"{mean(rows, 'l1'):.3f}",
-        f"{mean(rows, 'ssim') / sparsity:.2f} / {frame / sparsity:.2f}",
-    ]
-    return [f"{share:.1%}", method, f"{100 * sparsity:.2f}", *near, *errors]
+    means = {key: mean(rows, key) for key in ("sparsity", "ssim", "ssim_frame", "l1")}
+    efficiency = {"near": means["ssim"] / means["sparsity"], "frame": means["ssim_frame"] / means["sparsity"]}
+    near_thick = mean(thick, "ssim") if thick else None
+    return {**rows[0], **means, **efficiency, "sparsity": 100 * means["sparsity"], "thick": near_thick}
 
 
-def _needed(rows: list[Row]) -> str:
+def needed(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The sparsity that every PSF needs."""
     domains = [row["domain"] for row in rows]
     counts = ", ".join(f"{domains.count(name)} {name}" for name in dict.fromkeys(domains))
-    header = ["", "mean %", "median %"]
-    names = ("ours", "quad tree")
-    medians = {name: float(np.median([row[name] for row in rows])) for name in names}
-    return _section(
+    shares = {name: [100 * row[name] for row in rows] for name in ("ours", "quad tree")}
+    lines = [{"name": name, "mean": np.mean(share), "median": np.median(share)} for name, share in shares.items()]
+    return section(
         "Sparsity that a PSF needs",
         "The same capsules as banks represent them (the fewest points at SSIM near >= 0.97 and L1 <= 4 %, or each "
         f"pixel where that is no more; here {counts}), and the quad tree of the same L1.",
         "![distribution of sparsity](psfs_needed.png)",
-        table(header, [[name, f"{100 * mean(rows, name):.1f}", f"{100 * medians[name]:.1f}"] for name in names]),
+        row_table(lines, " | mean % | median %", "{name} | {mean:.1f} | {median:.1f}"),
     )
 
 
-def _sizes() -> str:
-    return _section(
+def sizes(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """Similarity against sparsity for several sizes: the plot says it."""
+    return section(
         "Sparsity and size",
         "Three sizes of each kind. Lines end where all candidates are taken.",
         "![similarity against sparsity for three sizes](psfs_sizes.png)",
     )
 
 
-def _samples(rows: list[Row], settings: Row) -> str:
+def samples(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """How near the samples of grids are."""
     ways = ("middle", "prefiltered", "linear")
-    return _section(
+    header = "cells | samples" + "".join(f" | {way}, near | {way}, frame" for way in ways)
+    cells = "{cells} | {samples}" + "".join(f" | {{{way}:.3f}} | {{{way}_frame:.4f}}" for way in ways)
+    return section(
         "Number of samples",
         f"Mean similarity of the PSF at {settings['coordinates']} random coordinates with the dense sample of its box "
         "(in the middle of the box, or pre-filtered over it), and with linear interpolation between middles.",
         "![similarity against the number of samples](psfs_samples.png)",
-        table(
-            ["cells", "samples", *(f"{way}, {where}" for way in ways for where in ("near", "frame"))],
-            [
-                [
-                    *(str(row["cells"]), str(row["samples"])),
-                    *(cell for way in ways for cell in (f"{row[way]:.3f}", f"{row[way + '_frame']:.4f}")),
-                ]
-                for row in rows
-            ],
-        ),
+        row_table(rows, header, cells),
     )
 
 
-def _ablation(rows: list[Row], settings: Row) -> str:
-    return _section(
+def ablation(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """What each step of LKS is worth."""
+    return section(
         "The steps of LKS",
         f"Mean L1 error of {settings['ablated']} of the capsules at {SPARSITY:.1%}, over that of darts alone.",
         table(
@@ -177,45 +106,32 @@ def _ablation(rows: list[Row], settings: Row) -> str:
     )
 
 
-def _large(rows: list[Row]) -> str:
-    def share(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2%}"
-
-    return _section(
+def large(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The sparsity that large PSFs need."""
+    header = "r px | l px | covers px | near | in the frame | SSIM near of all"
+    cells = "{radius:g} | {length:g} | {support} | {ssim:.2%} | {ssim_frame:.2%} | {best:.4f}"
+    return section(
         "Large PSFs",
         "The least sparsity at which the similarity is 0.99, and the similarity that all candidates have.",
-        table(
-            ["r px", "l px", "covers px", "near", "in the frame", "SSIM near of all"],
-            [
-                [
-                    *(f"{row['radius']:g}", f"{row['length']:g}", str(row["support"])),
-                    *(share(row["ssim"]), share(row["ssim_frame"]), f"{row['best']:.4f}"),
-                ]
-                for row in rows
-            ],
-        ),
+        row_table(rows, header, cells),
     )
 
 
-def _far(rows: list[Row], settings: Row) -> str:
-    return _section(
+def far(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """What is seen far away."""
+    return section(
         "Far field",
         "The largest magnitude beyond 1, 1.5, 2 and 4 half sides of a sample with 8 px around it, over its maximum, of "
         f"up to {settings['far']} Laplacian samples of each installed bank.",
-        table(
-            ["bank", "beyond", "mean", "largest"],
-            [
-                [f"`{row['bank']}`", f"{row['factor']:g} x", f"{row['mean']:.1e}", f"{row['largest']:.1e}"]
-                for row in rows
-            ],
-        ),
+        row_table(rows, "bank | beyond | mean | largest", "`{bank}` | {factor:g} x | {mean:.1e} | {largest:.1e}"),
     )
 
 
-def _rotation(rows: list[Row], total: Row) -> str:
-    degrees = list(dict.fromkeys(row["degrees"] for row in rows))
+def rotation(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The error of turned samples, by angle."""
+    degrees = distinct(rows, "degrees")
     chosen = [[row["l1"] for row in of(rows, degrees=angle)] for angle in degrees]
-    return _section(
+    return section(
         "Rotation",
         "Relative L1 error of a sample of `combined` that is turned as it is splatted, against the dense PSF turned. "
         "Turned points fall between pixels and are shared by four, which blurs by a part of a pixel.",
@@ -224,8 +140,15 @@ def _rotation(rows: list[Row], total: Row) -> str:
             ["degrees", *(f"{angle:g}" for angle in degrees)],
             [["mean", *(f"{np.mean(c):.3f}" for c in chosen)], ["largest", *(f"{max(c):.3f}" for c in chosen)]],
         ),
-        f"The sum of {total['splats']} splats of random colours, places and rotations has an error of "
-        f"{total['all']:.3f}, a splat alone {total['one']:.3f} in the mean. If the errors of splats that meet in a "
+    )
+
+
+def total(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The error of a sum of splats: a paragraph of the same section."""
+    (row,) = rows
+    return (
+        f"The sum of {row['splats']} splats of random colours, places and rotations has an error of "
+        f"{row['all']:.3f}, a splat alone {row['one']:.3f} in the mean. If the errors of splats that meet in a "
         f"pixel were independent, so that they add up like the root of their number, it would be "
-        f"{total['expected']:.3f}.",
+        f"{row['expected']:.3f}."
     )

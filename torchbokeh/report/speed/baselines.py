@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 
 import numpy as np
 import torch
@@ -48,29 +49,18 @@ def _scatters() -> list[Method]:
         return math.pi * (coc.double().square() + 1).sum().item()
 
     discs = "every pixel adds its disc, from a table of discs in steps of 1/4 px, compiled with numba"
+    points, rows = partial(dense_scatter, by_rows=False), partial(dense_scatter, by_rows=True)
+    about = (
+        "every pixel collects from all pixels of a search window whose disc, with an edge 1 px wide, covers it; "
+        "the window is that of the largest disc that reaches a tile of 16 px; compiled with numba"
+    )
+    family = "dense scatter"
     return [
+        Method(family, family, f"{discs}, point by point", points, lambda coc: _POINT * area(coc)),
         Method(
-            "dense scatter",
-            "dense scatter",
-            f"{discs}, point by point",
-            partial(dense_scatter, by_rows=False),
-            lambda coc: _POINT * area(coc),
+            f"{family} by rows", family, f"{discs}, whole rows of a disc at once", rows, lambda c: _ROW_POINT * area(c)
         ),
-        Method(
-            "dense scatter by rows",
-            "dense scatter",
-            f"{discs}, whole rows of a disc at once",
-            partial(dense_scatter, by_rows=True),
-            lambda coc: _ROW_POINT * area(coc),
-        ),
-        Method(
-            "gather",
-            "gather",
-            "every pixel collects from all pixels of a search window whose disc, with an edge 1 px wide, covers it; "
-            "the window is that of the largest disc that reaches a tile of 16 px; compiled with numba",
-            gather,
-            _gather_work,
-        ),
+        Method("gather", "gather", about, gather, _gather_work),
     ]
 
 
@@ -82,26 +72,19 @@ def _gather_work(coc: Tensor) -> float:
 
 def _layered_methods() -> list[Method]:
     kinds = {"layered FFT": (fft_convolution, _FFT_STEP), "layered direct": (direct_convolution, _PRODUCT)}
+    bins, over = "each convolved with its disc", "put over one another"
     explained = {
-        "over": "hard bins of the signed CoC, each convolved with its disc, put over one another",
-        "over, normalised": "hard bins of the signed CoC, each convolved with its disc, put over one another and "
-        "divided by alpha",
-        "sum, normalised": "hard bins of the radius, each convolved with its disc, added up and divided by coverage",
+        "over": f"hard bins of the signed CoC, {bins}, {over}",
+        "over, normalised": f"hard bins of the signed CoC, {bins}, {over} and divided by alpha",
+        "sum, normalised": f"hard bins of the radius, {bins}, added up and divided by coverage",
     }
     found = []
-    for family, (convolve, step) in kinds.items():
-        for count in LAYERS:
-            for join in JOINS[family]:
-                found.append(
-                    Method(
-                        f"{family} {count}, {join}",
-                        family,
-                        f"{count} {explained[join]}",
-                        partial(layered, layers=count, join=join, convolve=convolve),
-                        partial(_layer_seconds, count=count, which=list(kinds).index(family), step=step),
-                        normalised=join != "over",
-                    )
-                )
+    for which, (family, (convolve, step)) in enumerate(kinds.items()):
+        for count, join in product(LAYERS, JOINS[family]):
+            run = partial(layered, layers=count, join=join, convolve=convolve)
+            work = partial(_layer_seconds, count=count, which=which, step=step)
+            name, about = f"{family} {count}, {join}", f"{count} {explained[join]}"
+            found.append(Method(name, family, about, run, work, normalised=join != "over"))
     return found
 
 
@@ -120,36 +103,14 @@ def _fixed_kernels() -> list[Method]:
     def fft_work(coc: Tensor) -> float:
         return _FFT_STEP * 9 * 2.5 * coc.numel() * math.log2(coc.numel())
 
-    found = [
-        Method(
-            "kornia filter2d",
-            "fixed kernel",
-            "kornia.filters.filter2d with one disc, zeros beyond the border, divided by coverage",
-            partial(_one_kernel, convolve=filter2d),
-            direct_work,
-            one_depth=True,
-        ),
-        Method(
-            "kornia fft_conv",
-            "fixed kernel",
-            "kornia.filters.fft_conv with one disc, zeros beyond the border, divided by coverage",
-            partial(_one_kernel, convolve=fft_conv),
-            fft_work,
-            one_depth=True,
-        ),
-    ]
+    found = []
+    for convolve, work in ((filter2d, direct_work), (fft_conv, fft_work)):
+        name = convolve.__name__
+        about = f"kornia.filters.{name} with one disc, zeros beyond the border, divided by coverage"
+        run = partial(_one_kernel, convolve=convolve)
+        found.append(Method(f"kornia {name}", "fixed kernel", about, run, work, one_depth=True))
     if _blurgenerator_is_there():
-        found.append(
-            Method(
-                "blurgenerator",
-                "fixed kernel",
-                "blurgenerator.lens_blur: five complex Gaussians for one disc; 8 bits, as many threads as processors",
-                _blurgenerator,
-                lambda coc: 5e-9 * coc.numel() * (20 + 2 * coc.abs().max().item()),
-                normalised=False,  # by its five Gaussians to about a hundredth
-                one_depth=True,
-            )
-        )
+        found.append(_blurgenerator_method())
     return found
 
 
@@ -162,6 +123,15 @@ def _one_kernel(image: Tensor, coc: Tensor, convolve: Callable[..., Tensor]) -> 
 
 def _blurgenerator_is_there() -> bool:
     return find_spec("blurgenerator") is not None and find_spec("cv2") is not None
+
+
+def _blurgenerator_method() -> Method:
+    def work(coc: Tensor) -> float:
+        return 5e-9 * coc.numel() * (20 + 2 * coc.abs().max().item())
+
+    about = "blurgenerator.lens_blur: five complex Gaussians for one disc; 8 bits, as many threads as processors"
+    # Its five Gaussians are normalised to about a hundredth.
+    return Method("blurgenerator", "fixed kernel", about, _blurgenerator, work, normalised=False, one_depth=True)
 
 
 def _blurgenerator(image: Tensor, coc: Tensor) -> Tensor:

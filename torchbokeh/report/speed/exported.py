@@ -3,7 +3,7 @@
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -13,15 +13,14 @@ import torch
 from torch import Tensor
 
 import torchbokeh
-from torchbokeh.learn.export import OPSET, export_onnx
 from torchbokeh.ops.dispatch import definitions_only
-from torchbokeh.report.markdown import number, seconds, section, table
-from torchbokeh.report.measure import by_turns
+from torchbokeh.report.experiment import Experiment
+from torchbokeh.report.internals import OPSET
+from torchbokeh.report.markdown import row_table, section
+from torchbokeh.report.measure import Work, by_turns, work_seconds
+from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
-
-Work = Callable[[], Tensor]
 
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
 PYRAMID = "PyramidIntegrator"
@@ -60,7 +59,7 @@ def _rows(name: str, path: Path, settings: Settings) -> list[Row]:
         label, pyramid = PYRAMID, torchbokeh.PyramidIntegrator(levels=13)
         inputs = {size: (pyramid.differentiate(seen.image),) for size, seen in pictures.items()}
         eager = {size: partial(pyramid, *given) for size, given in inputs.items()}
-        export_onnx(pyramid, path, *inputs[max(pictures)])
+        torchbokeh.export_onnx(pyramid, path, *inputs[max(pictures)])
     else:
         label, blur = f"LensBlur {name}", torchbokeh.LensBlur(quality=name)
         plan = blur.plan(first.image, coc=first.coc)
@@ -69,7 +68,7 @@ def _rows(name: str, path: Path, settings: Settings) -> list[Row]:
             size: partial(blur, seen.image, coc=seen.coc, plan=replace(plan, size=(size, size)))
             for size, seen in pictures.items()
         }
-        export_onnx(blur, path, first.image, first.coc, plan=plan)
+        torchbokeh.export_onnx(blur, path, first.image, first.coc, plan=plan)
     about = {
         "method": label,
         "opset": OPSET,
@@ -86,7 +85,9 @@ def _compare(run: Work, eager: Work, settings: Settings) -> Row:
     with torch.no_grad():
         found, _, wanted = (work() for work in works.values())
         error = ((found - wanted).abs().max() / wanted.abs().max()).item()
-        times = by_turns({key: partial(_timed, work) for key, work in works.items()}, settings.repeat, settings.budget)
+        times = by_turns(
+            {key: partial(work_seconds, work) for key, work in works.items()}, settings.repeat, settings.budget
+        )
     medians = {f"{key}_seconds": statistics.median(s for (s,) in runs) for key, runs in times.items()}
     return {"error": error, **medians}
 
@@ -107,30 +108,19 @@ def _defined(work: Work) -> Tensor:
         return work()
 
 
-def _timed(work: Work) -> tuple[float]:
-    start = time.perf_counter()
-    work()
-    return (time.perf_counter() - start,)
-
-
-def export_section(rows: Sequence[Row], settings: Row) -> str:
-    """The rows of `exported` as a section of ``report.md``; empty without rows."""
-    if not rows:
-        return ""
+def export_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The rows of `exported` as a section of ``report.md``."""
     about = (
         f"photo with radii up to {settings['sweep_radius']:g} px, as a whole LensBlur, and its Laplacian through the "
         "integration network. One file runs at all sizes. *Error*: the largest against eager mode, relative to the "
         "largest value. Seconds in onnxruntime, in eager mode by the torch definitions, which are what is exported, "
         "and in eager mode as it comes, with kernels; *of torch*: onnxruntime over the torch definitions."
     )
-    head = ["method", "opset", "kB", "size", "error", "onnxruntime", "torch", "kernels", "of torch"]
-    cells = [
-        [
-            *(row["method"], str(row["opset"]), f"{row['bytes'] / 1e3:.0f}", str(row["size"])),
-            number(row["error"], ".1e"),
-            *(seconds(row[f"{key}_seconds"]) for key in ("file", "torch", "kernel")),
-            f"{row['file_seconds'] / row['torch_seconds']:.2f}",
-        ]
-        for row in rows
-    ]
-    return section("Exported files", about, table(head, cells))
+    rows = [{**r, "kB": r["bytes"] / 1e3, "of_torch": r["file_seconds"] / r["torch_seconds"]} for r in rows]
+    header = "method | opset | kB | size | error | onnxruntime | torch | kernels | of torch"
+    cells = "{method} | {opset} | {kB:.0f} | {size} | {error:.1e} | {file_seconds:t} | {torch_seconds:t} | "
+    cells += "{kernel_seconds:t} | {of_torch:.2f}"
+    return section("Exported files", about, row_table(rows, header, cells))
+
+
+EXPORT = Experiment("export", exported, export_section)

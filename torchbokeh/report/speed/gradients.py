@@ -1,99 +1,21 @@
 """Forward and backward: time and memory of this package beside plain autograd."""
 
-import math
 import statistics
 import time
 from collections.abc import Sequence
 from functools import partial
 
 import torch
-from torch import Tensor
-from torch.nn import functional as F
 
-import torchbokeh
-from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.splat import _splat_spans_torch
-from torchbokeh.psfs.aperture import Disc
-from torchbokeh.report.markdown import seconds, section, skipped, table
+from torchbokeh.report.experiment import Experiment
+from torchbokeh.report.markdown import row_table, section, skipped
 from torchbokeh.report.measure import by_turns
+from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.scenes import Picture, photo
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
+from torchbokeh.report.speed.autograd import SPANS, gradient_methods, held
 from torchbokeh.report.speed.memory import peak_memory
-from torchbokeh.report.speed.methods import Method, own_methods, own_name
-
-QUALITIES = ("exact", "balanced")
-COMPOSED = "LensBlur"
-SPANS = "autograd, row intervals"
-DENSE = "autograd, dense"
-
-# Bytes that a graph keeps: for each row interval of a pixel, for each pixel and offset, for each pixel and bin of a
-# sub-aperture, and for each pixel besides.
-_INTERVAL, _OFFSET, _BIN, _PIXEL = 500, 8, 85, 300
-
-
-def gradient_methods() -> dict[str, Method]:
-    """What is compared, by name: this package's operating points, and the same sums left to autograd."""
-    found = [own_methods()[own_name(quality)] for quality in QUALITIES]
-    for quality in QUALITIES:
-        blur = torchbokeh.LensBlur(quality=quality)
-        about = f"LensBlur(quality={quality!r}) of an image: foreground, filled background and composition"
-        found.append(Method(f"{COMPOSED} {quality}", COMPOSED, about, partial(_lens_blur, blur), _seconds))
-    rows = "the torch definition of the exact splat, row by row in double, its graph built by autograd"
-    discs = "every pixel adds its disc, offset by offset with an edge 1 px wide, its graph built by autograd"
-    found.append(Method(SPANS, "autograd", rows, interval_splat, _seconds))
-    found.append(Method(DENSE, "autograd", discs, dense_splat, _seconds))
-    return {method.name: method for method in found}
-
-
-def _seconds(coc: Tensor) -> float:
-    return 0.0  # memory is what limits these
-
-
-def _lens_blur(blur: torchbokeh.LensBlur, image: Tensor, coc: Tensor) -> Tensor:
-    return blur(image, coc=coc)
-
-
-def interval_splat(image: Tensor, coc: Tensor) -> Tensor:
-    """The torch definition of the exact one-layer blur, without the adjoint that this package gives it."""
-    out = _splat_spans_torch(torch.cat([image, torch.ones_like(coc)], 1), coc, Disc().profile(), True)
-    return out[:, :-1] / out[:, -1:].clamp_min(TINY)
-
-
-def dense_splat(image: Tensor, coc: Tensor) -> Tensor:
-    """Every pixel adds its disc, with an edge 1 px wide, and the sum is divided by its coverage."""
-    height, width = image.shape[-2:]
-    radius = coc.abs().clamp_min(0.5)
-    reach = math.ceil(radius.max().item())
-    shares = torch.cat([image, torch.ones_like(coc)], 1) / (math.pi * radius.square())
-    shares, radius = F.pad(shares, (reach,) * 4), F.pad(radius, (reach,) * 4)
-    out = torch.zeros_like(shares[..., :height, :width])
-    for y in range(2 * reach + 1):
-        for x in range(2 * reach + 1):
-            away = math.hypot(y - reach, x - reach)
-            if away < reach + 0.5:
-                seen = (..., slice(y, y + height), slice(x, x + width))
-                out.addcmul_(shares[seen], (radius[seen] + (0.5 - away)).clamp(0, 1))  # in place: the least to keep
-    return out[:, :-1] / out[:, -1:].clamp_min(TINY)
-
-
-def held(name: str, coc: Tensor) -> float:
-    """Bytes that a method keeps for its backward pass, at most, about. It decides what is left out, nothing else.
-
-    Args:
-        name: of `gradient_methods`.
-        coc: ``(1, 1, H, W)``.
-    """
-    radius = coc.abs()
-    if name == SPANS:
-        return _INTERVAL * (2 * radius.double() + 3).sum().item()
-    each = 0.0
-    if name == DENSE:
-        each = _OFFSET * math.pi * (radius.max().item() + 0.5) ** 2
-    elif name.startswith(COMPOSED):
-        plan = torchbokeh.LensBlur(quality=name.split()[1]).plan(coc, coc=coc)
-        each = 2000 + _BIN * plan.subapertures**2 * sum(map(len, plan.bins))
-    return coc.numel() * (_PIXEL + each)
+from torchbokeh.report.speed.methods import Method
 
 
 def gradients(settings: Settings, say: Say) -> list[Row]:
@@ -159,10 +81,8 @@ def _beside(row: Row, rows: Sequence[Row]) -> Row:
     return {"times_faster": _whole(plain) / _whole(row), "times_smaller": memory}
 
 
-def gradient_section(rows: Sequence[Row], settings: Row) -> str:
-    """The rows of `gradients` as a section of ``report.md``; empty without rows."""
-    if not rows:
-        return ""
+def gradient_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    """The rows of `gradients` as a section of ``report.md``."""
     memory = settings["gradient_memory"]
     about = (
         "photo; radius up to so many px. Seconds of a forward pass and of the backward pass to image and CoC. Peak "
@@ -171,16 +91,11 @@ def gradient_section(rows: Sequence[Row], settings: Row) -> str:
         "autograd through the torch definition, in whole time and in memory. LensBlur does more than the others: it "
         "composes two surfaces."
     )
-    head = ["size", "radius", "method", "forward", "backward", "MB per megapixel", "times faster", "times smaller"]
-    cells = []
-    for row in rows:
-        what = [str(row["size"]), f"{row['radius']:g}", row["method"]]
-        if "skipped" in row:
-            cells.append([*what, *["-"] * 5])
-            continue
-        peak = "-" if row["peak_bytes"] is None else f"{row['bytes_per_megapixel'] / 1e6:.0f}"
-        times = ("-" if row[key] is None else f"{row[key]:.2g}" for key in ("times_faster", "times_smaller"))
-        both = (seconds(row[f"{way}_seconds"]) for way in ("forward", "backward"))
-        cells.append([*what, *both, peak, *times])
-    left = skipped([{**row, "where": f"{row['size']} px, radius {row['radius']:g} px"} for row in rows])
-    return section("Forward and backward", about, table(head, cells), left)
+    header = "size | radius | method | forward | backward | MB per megapixel | times faster | times smaller"
+    cells = "{size} | {radius:g} | {method} | {forward_seconds:t} | {backward_seconds:t} | {bytes_per_megapixel:M} | "
+    cells += "{times_faster:.2g} | {times_smaller:.2g}"
+    left = skipped(rows, " at {size} px, radius {radius:g} px")
+    return section("Forward and backward", about, row_table(rows, header, cells), left)
+
+
+GRADIENTS = Experiment("gradients", gradients, gradient_section)

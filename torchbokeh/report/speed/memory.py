@@ -14,6 +14,8 @@ from pathlib import Path
 
 import torch
 
+from torchbokeh.report.speed.registry import every_method
+
 _STATUS = Path("/proc/self/status")
 _RESET = Path("/proc/self/clear_refs")
 
@@ -27,7 +29,7 @@ def peak_memory(method: str, size: int, radius: float, *, backward: bool = False
     """Bytes that a method needs beyond its inputs for one square picture.
 
     Args:
-        method: the name of a baseline, of an operating point of this package, or of `gradients.gradient_methods`.
+        method: the name of one of `torchbokeh.report.speed.registry.every_method`.
         size: side in px.
         radius: of the largest blur in px; the CoC is a ramp from minus this to this.
         backward: of a forward pass and the backward pass to image and CoC, together; else of the picture alone.
@@ -56,12 +58,8 @@ def resident(key: str) -> int:
 
 
 def _measure(method: str, size: int, radius: float, backward: bool, threads: int) -> int:
-    from torchbokeh.report.speed.baselines import baselines
-    from torchbokeh.report.speed.gradients import gradient_methods
-    from torchbokeh.report.speed.methods import own_methods
-
     torch.set_num_threads(threads)
-    run = {**own_methods(), **baselines(), **gradient_methods()}[method].run
+    run = every_method()[method].run
     with torch.inference_mode(not backward):
         for side in (64, size):
             image = torch.rand(1, 3, side, side)

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchbokeh.plan import quality as quality_module
+import torchbokeh
+from torchbokeh.report.internals import QUALITY_NAMES
+from torchbokeh.report.rows import OWN
 
 Blur = Callable[[Tensor, Tensor], Tensor]
-
-QUALITIES = tuple(quality.name for quality in quality_module.QUALITIES)
-OWN = "torchbokeh"
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Method:
 
 def own_methods() -> dict[str, Method]:
     """The operating points of this package's one-layer splat, from exact to fast."""
-    return {_own(quality).name: _own(quality) for quality in QUALITIES}
+    return {own_name(quality): _own(quality) for quality in QUALITY_NAMES}
 
 
 def own_name(quality: str) -> str:
@@ -63,16 +62,10 @@ def own_name(quality: str) -> str:
 
 
 def _own(quality: str) -> Method:
-    import torchbokeh
-
-    module = torchbokeh.KernelSplatting(aperture="disc", quality=quality)
-
-    def run(image: Tensor, coc: Tensor) -> Tensor:
-        return module(image, coc)
+    splatting = torchbokeh.KernelSplatting(aperture="disc", quality=quality)
 
     def work(coc: Tensor) -> float:
         return coc.numel() * 4e-9 * (20 + 2 * coc.abs().mean().item())  # at most: two points for every row of a disc
 
     how = "two points for every row of a disc" + ("" if quality == "exact" else ", wide discs merged by radius")
-    description = f"KernelSplatting(quality={quality!r}): {how}"
-    return Method(own_name(quality), OWN, description, run, work)
+    return Method(own_name(quality), OWN, f"KernelSplatting(quality={quality!r}): {how}", splatting, work)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchbokeh.ops.merge import highest_level, level_shares, merge_cells
 from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.plan.quality import QUALITIES
+from torchbokeh.report.internals import QUALITIES
 
 RECORD_BYTES, LANE_BYTES = 32, 16
 """Of a cell with its sums, and of a pixel of four float32 lanes."""

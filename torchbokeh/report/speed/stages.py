@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -11,10 +11,13 @@ from torch import Tensor
 
 from torchbokeh.ops.dispatch import numba_is_there
 from torchbokeh.ops.system.threads import recorded
+from torchbokeh.report.experiment import Experiment
+from torchbokeh.report.internals import QUALITY_NAMES
+from torchbokeh.report.markdown import row_table, section
+from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
-from torchbokeh.report.speed.experiments import Row, Say
-from torchbokeh.report.speed.methods import QUALITIES, own_methods, own_name
+from torchbokeh.report.speed.methods import own_methods, own_name
 from torchbokeh.report.speed.roofline import least_seconds, measured_rates
 
 Recorder = Callable[[], AbstractContextManager[dict[str, float]]]
@@ -38,7 +41,7 @@ def stages(settings: Settings, say: Say) -> list[Row]:
     for radius in settings.photo_radii:
         say(f"share of each stage: radius {radius:g} px")
         seen = photo(settings.photo_size, radius)
-        for quality in QUALITIES:
+        for quality in QUALITY_NAMES:
             run = own_methods()[own_name(quality)].run
             found = shares(partial(run, seen.image, seen.coc), recorded, settings.repeat)
             least = least_seconds(seen.image, seen.coc, quality, rates)
@@ -69,3 +72,12 @@ def shares(work: Callable[[], Tensor], recorded: Recorder, repeat: int) -> list[
     names = dict.fromkeys(name for part in parts for name in part)
     medians = {name: statistics.median(part.get(name, 0.0) for part in parts) for name in names}
     return [{"stage": name, "seconds": value, "share": value / total} for name, value in medians.items()]
+
+
+def _section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
+    header = "quality | radius | stage | seconds | share | least seconds"
+    cells = "{quality} | {radius:g} | {stage} | {seconds:t} | {share:.0%} | {least_seconds:t}"
+    return section("Share of each stage", row_table(rows, header, cells))
+
+
+STAGES = Experiment("stages", stages, _section)

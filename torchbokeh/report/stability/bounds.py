@@ -15,16 +15,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchbokeh.banks.highlights import BRIGHT
-from torchbokeh.compose.surfaces import COARSE, FOREGROUND
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import STEPS
 from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.plan.quality import QUALITIES
+from torchbokeh.report.internals import BRIGHT, COARSE, FOREGROUND, QUALITIES, STEPS_OF_VIEWS
 from torchbokeh.report.stability.cases import Case
 from torchbokeh.report.stability.renderer import Renderer
 from torchbokeh.report.stability.renderers import coverage
-from torchbokeh.views.layers import STEPS as STEPS_OF_VIEWS
 
 U64 = torch.finfo(torch.float64).eps / 2
 

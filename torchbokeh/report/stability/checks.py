@@ -3,25 +3,34 @@
 import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.learn.integration import FFTIntegrator, Integrator, PyramidIntegrator, ScanlineIntegrator
-from torchbokeh.lens import ThinLens
-from torchbokeh.lens.dispersion import Dispersion
-from torchbokeh.psfs.bank import PsfBank
+import torchbokeh
+from torchbokeh import KernelSplatting, LensBlur, PyramidIntegrator
 from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import Sparse
 from torchbokeh.psfs.represent import Represented, laplacian, nonzero
-from torchbokeh.renderers.kernel_splatting import KernelSplatting
-from torchbokeh.renderers.lens_blur import LensBlur
+from torchbokeh.report.rows import Row
 from torchbokeh.report.stability.bounds import DENORMAL, PRECISIONS, U64
 from torchbokeh.report.stability.cases import Case, beyond, dynamic_range, even, slope, texture
+from torchbokeh.report.stability.renderer import Renderer
 from torchbokeh.report.stability.renderers import renderers
-from torchbokeh.report.stability.rows import Row, autocast, row
+from torchbokeh.report.stability.rows import (
+    CONSTANT,
+    LEAK,
+    OUTSIDE,
+    STRANGE,
+    autocast,
+    off,
+    outside,
+    row,
+    strange,
+    worst,
+)
 
 U32 = torch.finfo(torch.float32).eps / 2
 PLAIN = tuple(p for p in PRECISIONS if p.autocast is None)
@@ -50,7 +59,7 @@ def lens_rows(side: int) -> Iterator[Row]:
     image = texture(side, side)
     for name, change in LENSES.items():
         values = {"focal_length": 0.05, "f_number": 1.8, "focus_distance": 2.0, "sensor_width": 0.036} | change
-        lens = ThinLens(*values.values())
+        lens = torchbokeh.ThinLens(*values.values())
         for precision in PLAIN:
             depth = near.to(precision.dtype)
             depth = torch.where(depth.isinf() & ~near.isinf(), torch.finfo(precision.dtype).max, depth)
@@ -60,33 +69,32 @@ def lens_rows(side: int) -> Iterator[Row]:
             gain = f * f / (2 * n) / (1 - f / df) * side / sensor
             want = gain * (1 / df - 1 / d)
             bound = 4 * precision.work * (gain * (1 / df + 1 / d) + want.abs() / (1 - f / df))
-            ratio = ((coc - want).abs() / bound).nan_to_num(torch.inf)
-            k = int(ratio.argmax())
-            measured, limit = float((coc - want).abs().flatten()[k]), float(bound.flatten()[k])
-            yield row("ThinLens.coc", f"lens: {name}", precision.name, "error in px", measured, limit)
+            here = ("ThinLens.coc", f"lens: {name}", precision.name)
+            yield row(*here, "error in px", *worst((coc - want).abs(), bound))
             if name == "50 mm, f/1.8 at 2 m":
-                yield row(
-                    "ThinLens.coc", "lens: depth in focus", precision.name, "CoC in px", float(coc[0, 0, 0, 1]), 0
-                )
+                focused = float(coc[0, 0, 0, 1])
+                yield row("ThinLens.coc", "lens: depth in focus", precision.name, "CoC in px", focused, 0)
         for quality in ("exact", "balanced"):
             out = LensBlur(lens, quality=quality)(image.float(), near.float())
             yield from _sound(f"LensBlur image, {quality}", f"lens: {name}, depth 1e-3 to 1e12 m", out, image)
     for axial, lateral in ((59.0, 0.0), (-100.0, 0.0), (0.3, 50.0), (0.3, -50.0)):
-        dispersion = Dispersion("BK7", axial=axial, lateral=lateral)
-        lens = ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=dispersion)
+        dispersion = torchbokeh.Dispersion("BK7", axial=axial, lateral=lateral)
+        lens = torchbokeh.ThinLens(0.05, 1.8, 2.0, 0.036, dispersion=dispersion)
         out = LensBlur(lens)(image.float(), near.float().clamp(0.5, 1e4))
-        yield from _sound(
-            "LensBlur image, exact", f"lens: dispersion, axial {axial:g}, lateral {lateral:g}", out, image
-        )
+        case = f"lens: dispersion, axial {axial:g}, lateral {lateral:g}"
+        yield from _sound("LensBlur image, exact", case, out, image)
 
 
 def _sound(renderer: str, case: str, out: Tensor, image: Tensor) -> Iterator[Row]:
     """All finite and, as a mean of what was given, within its range."""
-    yield row(renderer, case, "float32", "not finite, or of another dtype", int((~out.isfinite()).sum()), 0)
-    outside = torch.maximum(image.min() - out, out - image.max()).clamp_min(0)
-    yield row(
-        renderer, case, "float32", "outside of [min, max]", float(outside.max()), 64 * U32 * float(image.abs().max())
-    )
+    here = (renderer, case, "float32")
+    yield row(*here, STRANGE, strange(out, out.dtype), 0)
+    yield row(*here, OUTSIDE, _outside(out, image), 64 * U32 * float(image.abs().max()))
+
+
+def _outside(out: Tensor, image: Tensor) -> float:
+    """How far a picture is outside of the range of another, at most."""
+    return float(outside(out, image.min(), image.max()).max())
 
 
 def integrator_rows(side: int) -> Iterator[Row]:
@@ -96,18 +104,16 @@ def integrator_rows(side: int) -> Iterator[Row]:
     times ``u64 |b|_2 |g|_2``. *Pyramid*: in float32, 25 products on each of ``log2(n) + 2`` levels, both ways, of what
     the transposed sums of magnitudes are. All are held to the magnitudes of the buffer times the largest response.
     """
-    y, x = (
-        torch.arange(side, dtype=torch.float64)[:, None] - side / 2,
-        torch.arange(side, dtype=torch.float64) - side / 2,
-    )
+    x = torch.arange(side, dtype=torch.float64) - side / 2
+    y = x[:, None]
     disc = (torch.hypot(y, x) < side / 4).double()[None, None]
     point = torch.zeros(1, 1, side, side, dtype=torch.float64)
     point[..., side // 3, side // 3] = 1e6
     levels = math.ceil(math.log2(side)) + 2
-    integrators: dict[str, tuple[Integrator, float, float]] = {
-        "ScanlineIntegrator": (ScanlineIntegrator(), 1.0, side * U64),
-        "FFTIntegrator": (FFTIntegrator(), 1.3, 16 * levels * U64),
-        "FFTIntegrator, compact": (FFTIntegrator(compact=True), 1.3, 16 * levels * U64),
+    integrators: dict[str, tuple[Any, float, float]] = {
+        "ScanlineIntegrator": (torchbokeh.ScanlineIntegrator(), 1.0, side * U64),
+        "FFTIntegrator": (torchbokeh.FFTIntegrator(), 1.3, 16 * levels * U64),
+        "FFTIntegrator, compact": (torchbokeh.FFTIntegrator(compact=True), 1.3, 16 * levels * U64),
         "PyramidIntegrator": (PyramidIntegrator(), 1.3, 0.0),
     }
     for name, (integrator, response, double) in integrators.items():
@@ -128,12 +134,9 @@ def integrator_rows(side: int) -> Iterator[Row]:
                 work = max(precision.work * 50 * levels if name == "PyramidIntegrator" else 0.0, double)
                 bound = (precision.work + precision.store) * want.abs() + work * response * given.double().abs().sum()
                 bound = bound + DENORMAL * precision.least
-                error = (out.double() - want).abs()
-                strange = int((~out.isfinite()).sum()) + (out.dtype != precision.dtype)
                 here = (name, f"integrator: {case}", precision.name)
-                yield row(*here, "not finite, or of another dtype", strange, 0)
-                k = int((error / bound.clamp_min(1e-300)).argmax())
-                yield row(*here, "error", float(error.flatten()[k]), float(bound.flatten()[k]))
+                yield row(*here, STRANGE, strange(out, precision.dtype), 0)
+                yield row(*here, "error", *worst((out.double() - want).abs(), bound))
         far = torch.hypot(y + side // 8, x + side // 8) > side / 4 + 2
         u = (disc * 1e6 / 3).roll((-(side // 8),) * 2, (2, 3)).float()
         with torch.no_grad():
@@ -143,7 +146,7 @@ def integrator_rows(side: int) -> Iterator[Row]:
         approximates = name == "PyramidIntegrator"
         limit += PYRAMID * 1e6 / 3 if approximates else 0.0
         here = (name, "integrator: a disc of 3e5 by itself", "float32")
-        yield row(*here, "far-field leak", leak, limit, stated=approximates)
+        yield row(*here, LEAK, leak, limit, stated=approximates)
 
 
 def highlight_rows(side: int) -> Iterator[Row]:
@@ -153,14 +156,17 @@ def highlight_rows(side: int) -> Iterator[Row]:
         coc = slope(side, side, 0.95 * radius, radius)
         here = replace(case, coc=coc, group="highlight", name=f"1e6 over 1, radius {radius:.1f} px")
         for renderer in renderers():
-            motion = renderer.motion(here)
-            way = None if motion is None else motion.float()
-            far = beyond(here, renderer.reach(here), mirrored=renderer.layered)
-            lit, plain = (
-                renderer.run(t, coc.float(), way) for t in (case.image.float(), torch.ones_like(case.image).float())
-            )
-            leak = float((lit - plain)[:, :3, far].abs().max()) if bool(far.any()) else math.nan
-            yield row(renderer.name, here, "float32", "far-field leak", leak, 1e-3, pixels=int(far.sum()), stated=True)
+            yield _leak_row(renderer, here, beyond(here, renderer.reach(here), mirrored=renderer.layered))
+
+
+def _leak_row(renderer: Renderer, case: Case, far: Tensor) -> Row:
+    """What the highlights of a case add to pixels, in float32: a promise."""
+    motion = renderer.motion(case)
+    way = None if motion is None else motion.float()
+    image, coc = case.image.float(), case.coc.float()
+    lit, plain = (renderer.run(t, coc, way) for t in (image, torch.ones_like(image)))
+    leak = float((lit - plain)[:, :3, far].abs().max()) if bool(far.any()) else math.nan
+    return row(renderer.name, case, "float32", LEAK, leak, 1e-3, pixels=int(far.sum()), stated=True)
 
 
 def field_rows(names: Collection[str] = (), edge: int = 100) -> Iterator[Row]:
@@ -171,22 +177,14 @@ def field_rows(names: Collection[str] = (), edge: int = 100) -> Iterator[Row]:
         edge: of the square in px.
     """
     side = edge + 140
-    image = torch.ones(1, 3, side, side)
+    image = torch.ones(1, 3, side, side, dtype=torch.float64)
     image[..., :edge, :edge] = 1e6
-    coc = slope(side, side, 4.5, 5.0)
-    here = Case("highlight", f"{edge} x {edge} of 1e6 over 1", image.double(), coc)
-    column, row_ = torch.arange(side), torch.arange(side)[:, None]
+    here = Case("highlight", f"{edge} x {edge} of 1e6 over 1", image, slope(side, side, 4.5, 5.0))
+    x, y = torch.arange(side), torch.arange(side)[:, None]
     for renderer in renderers():
-        if names and renderer.name not in names:
-            continue
-        motion, reach = renderer.motion(here), edge - 1 + renderer.reach(here)
-        way = None if motion is None else motion.float()
-        far = (column > reach) | (row_ > reach)
-        if renderer.layered:
-            far = row_ > reach + 0 * column
-        lit, plain = (renderer.run(t, coc.float(), way) for t in (image, torch.ones_like(image)))
-        leak = float((lit - plain)[:, :3, far].abs().max()) if bool(far.any()) else math.nan
-        yield row(renderer.name, here, "float32", "far-field leak", leak, 1e-3, pixels=int(far.sum()), stated=True)
+        if not names or renderer.name in names:
+            reach = edge - 1 + renderer.reach(here)
+            yield _leak_row(renderer, here, y > reach + 0 * x if renderer.layered else (x > reach) | (y > reach))
 
 
 def layer_rows(side: int) -> Iterator[Row]:
@@ -198,14 +196,12 @@ def layer_rows(side: int) -> Iterator[Row]:
         layers = torch.cat([0.7 * alpha.expand(-1, -1, 3, -1, -1), alpha], 2)
         coc = torch.linspace(-6, 6, count).view(1, count, 1, 1, 1).expand(1, count, 1, side, side).contiguous()
         for quality in ("exact", "balanced"):
-            out = LensBlur(quality=quality)(layers, coc=coc)
-            off = float((out - torch.tensor([0.7, 0.7, 0.7, 1.0]).view(1, 4, 1, 1)).abs().max())
+            blur, name = LensBlur(quality=quality), f"LensBlur layers, {quality}"
+            found = off(blur(layers, coc=coc), torch.tensor([0.7, 0.7, 0.7, 1.0]).view(1, 4, 1, 1))
             case = f"layers: {count}, the first half of them empty"
-            yield row(f"LensBlur layers, {quality}", case, "float32", "off the constant", off, (64 + 8 * count) * U32)
-            nothing = float(LensBlur(quality=quality)(torch.zeros_like(layers), coc=coc).abs().max())
-            yield row(
-                f"LensBlur layers, {quality}", f"layers: {count}, alpha 0", "float32", "light from nothing", nothing, 0
-            )
+            yield row(name, case, "float32", CONSTANT, found, (64 + 8 * count) * U32)
+            nothing = off(blur(torch.zeros_like(layers), coc=coc), 0.0)
+            yield row(name, f"layers: {count}, alpha 0", "float32", "light from nothing", nothing, 0)
 
 
 def bank_rows(side: int) -> Iterator[Row]:
@@ -225,17 +221,10 @@ def bank_rows(side: int) -> Iterator[Row]:
     motion = torch.tensor([6.0, 0.0]).view(1, 2, 1, 1).expand(1, 2, side, side)
     for name, sample in ways.items():
         model = Combined(radius=8.0, length=16.0)
-        bank = PsfBank(model, [sample] * len(model.grid))
+        bank = torchbokeh.PsfBank(model, [sample] * len(model.grid))
         out = KernelSplatting(quality="exact", bank=bank)(image, even(side, side, 3.0).float(), motion=motion)
         # As many roundings as a buffer has points, each of a constant relative to its coverage.
-        yield row(
-            "KernelSplatting, bank", f"psf: {name}", "float32", "off the constant", float((out - 0.7).abs().max()), 1e-4
-        )
-
-
-def _by_coc(blur: LensBlur, image: Tensor, coc: Tensor) -> Tensor:
-    out: Tensor = blur(image, coc=coc)
-    return out
+        yield row("KernelSplatting, bank", f"psf: {name}", "float32", CONSTANT, off(out, 0.7), 1e-4)
 
 
 def iteration_rows(side: int, times: int = 100) -> Iterator[Row]:
@@ -247,17 +236,19 @@ def iteration_rows(side: int, times: int = 100) -> Iterator[Row]:
     for quality in ("exact", "balanced"):
         calls: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
             f"KernelSplatting, {quality}": KernelSplatting(quality=quality),
-            f"LensBlur image, {quality}": partial(_by_coc, LensBlur(quality=quality)),
+            f"LensBlur image, {quality}": _by_coc(LensBlur(quality=quality)),
         }
         for name, call in calls.items():
             got, flat = image, torch.full_like(image, 0.7)
             for _ in range(times):
                 got, flat = call(got, coc), call(flat, coc)
-            outside = float(torch.maximum(image.min() - got, got - image.max()).max().clamp_min(0))
-            top = float(image.max())
-            case = f"iteration: {times} times"
-            yield row(name, case, "float32", "outside of [min, max]", outside, 16 * times * U32 * top)
-            yield row(name, case, "float32", "off the constant", float((flat - 0.7).abs().max()), 16 * times * U32)
+            here, rounded = (name, f"iteration: {times} times", "float32"), 16 * times * U32
+            yield row(*here, OUTSIDE, _outside(got, image), rounded * float(image.max()))
+            yield row(*here, CONSTANT, off(flat, 0.7), rounded)
+
+
+def _by_coc(blur: LensBlur) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda image, coc: blur(image, coc=coc)
 
 
 def gradient_rows(side: int) -> Iterator[Row]:
@@ -309,9 +300,9 @@ def large_rows(height: int, width: int) -> Iterator[Row]:
     blurs: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
         "KernelSplatting, exact": KernelSplatting(quality="exact"),
         "KernelSplatting, balanced": KernelSplatting(quality="balanced"),
-        "LensBlur image, balanced": partial(_by_coc, LensBlur(quality="balanced")),
+        "LensBlur image, balanced": _by_coc(LensBlur(quality="balanced")),
     }
     for name, blur in blurs.items():
         out = blur(image, coc)
-        off = float((out - 0.7).abs().max()) if bool(out.isfinite().all()) else math.inf
-        yield row(name, f"size: {height} x {width}", "float32", "off the constant", off, 64 * U32)
+        found = off(out, 0.7) if bool(out.isfinite().all()) else math.inf
+        yield row(name, f"size: {height} x {width}", "float32", CONSTANT, found, 64 * U32)

@@ -2,38 +2,33 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.banks import highlights as bank_highlights
-from torchbokeh.banks import samples as bank_samples
-from torchbokeh.banks import splat as bank_splatting
-from torchbokeh.learn.integration import FFTIntegrator, PyramidIntegrator
+from torchbokeh import FFTIntegrator, KernelSplatting, PyramidIntegrator
 from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.convolve import convolve
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import laplacian, poisson_fft
 from torchbokeh.ops.splat import splat_spans
-from torchbokeh.picture.coc import WIDEST
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.combined import capsule
 from torchbokeh.psfs.refit import drawn
-from torchbokeh.renderers.kernel_splatting import KernelSplatting
+from torchbokeh.report.internals import WIDEST, bank_highlights, bank_samples, bank_splatting
+from torchbokeh.report.rows import Row
 from torchbokeh.report.stability.cases import even, slope
 from torchbokeh.report.stability.renderer import bank_of
+from torchbokeh.report.stability.rows import off
 
-Mechanism = dict[str, Any]
 
-
-def _row(mechanism: str, case: str, without: float, kept: float) -> Mechanism:
+def _row(mechanism: str, case: str, without: float | Tensor, kept: float | Tensor) -> Row:
     return {"mechanism": mechanism, "case": case, "without": float(without), "with": float(kept)}
 
 
-def mechanism_rows(side: int) -> Iterator[Mechanism]:
+def mechanism_rows(side: int) -> Iterator[Row]:
     """All of them, on pictures of about ``side`` px; errors are absolute, on a ground of 1, if nothing else is said."""
     yield _running_sum(side)
     yield _convolution(side)
@@ -56,7 +51,7 @@ def _far(side: int, radius: float) -> Tensor:
     return torch.hypot(y + 0.0 * x, x + 0.0 * y) > radius + 3
 
 
-def _running_sum(side: int) -> Mechanism:
+def _running_sum(side: int) -> Row:
     """One splat of a highlight, its differences summed in float32 and in double."""
     radius, profile = side / 8, Disc().profile()
     image, coc = _lit(side), slope(side, side, 0.9 * radius, radius).float()
@@ -64,10 +59,10 @@ def _running_sum(side: int) -> Mechanism:
     double = splat_spans(image, coc, profile, integrate=True)
     want, far = dense_spans(image, coc, profile), _far(side, radius)
     errors = ((t.double() - want)[..., far].abs().max() for t in (torch.from_numpy(single), double))
-    return _row("running sums in double", "far-field leak of 3e5", *(float(e) for e in errors))
+    return _row("running sums in double", "far-field leak of 3e5", *errors)
 
 
-def _convolution(side: int) -> Mechanism:
+def _convolution(side: int) -> Row:
     """One convolution with a disc, by FFT in float32 and in double."""
     disc = torch.from_numpy(capsule(side / 8, 0.0))[None].float()
     image, far = _lit(side), _far(side, side / 8)
@@ -77,10 +72,10 @@ def _convolution(side: int) -> Mechanism:
     single = torch.fft.irfft2(product, s=size)[..., reach : reach + side, reach : reach + side]
     want = convolve(image.double(), disc.double())
     errors = ((t.double() - want)[..., far].abs().max() for t in (single, convolve(image, disc)))
-    return _row("FFT of an even blur in double", "far-field leak of 3e5", *(float(e) for e in errors))
+    return _row("FFT of an even blur in double", "far-field leak of 3e5", *errors)
 
 
-def _highlights(side: int) -> Iterator[Mechanism]:
+def _highlights(side: int) -> Iterator[Row]:
     """Highlights through sparse PSFs like all pixels, and drawn by themselves: the error within their PSF."""
     at, splatting = (side // 4, side // 3), KernelSplatting(quality="exact", bank=bank_of("combined"))
     way = torch.tensor([6.0, -3.0]).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
@@ -101,7 +96,7 @@ def _highlights(side: int) -> Iterator[Mechanism]:
     yield _region(side)
 
 
-def _region(side: int) -> Mechanism:
+def _region(side: int) -> Row:
     """A bright region like all else, and apart, with nothing beyond the support of its PSFs."""
     image, coc = torch.ones(1, 3, side, side), even(side, side, 5.0).float()
     image[..., : side // 2, : side // 2] = 1000.0
@@ -114,7 +109,7 @@ def _region(side: int) -> Mechanism:
     return _row("bright regions apart", "far-field leak of a region of 1000", *leaks)
 
 
-def _moments() -> Mechanism:
+def _moments() -> Row:
     """A sparse Laplacian whose values are rounded to half precision, so that its moments do not vanish any more."""
     bank = bank_of("combined")
     chosen = (bank.domains == 2).nonzero()[-1]
@@ -128,7 +123,7 @@ def _moments() -> Mechanism:
     return _row("moments of sparse PSFs that vanish", "relative, at twice the half side", *leaks)
 
 
-def _integrals(side: int) -> Iterator[Mechanism]:
+def _integrals(side: int) -> Iterator[Row]:
     """Laplacians that do not sum to 0, on a torus and in free space; the pyramid beside the FFT."""
     point = torch.zeros(1, 1, side, side)
     point[..., side // 2, side // 2] = 1.0
@@ -145,35 +140,29 @@ def _integrals(side: int) -> Iterator[Mechanism]:
     yield _row("FFT, not the pyramid", "a disc of 1", *both)
 
 
-def _normalisation(side: int) -> Iterator[Mechanism]:
+def _normalisation(side: int) -> Iterator[Row]:
     """The coverage under what was spread, for a constant under a blur that jumps; and radii beyond all measure."""
     coc = slope(side, side, 0.0, 30.0).float() * (torch.arange(side) % 2)
     image, profile = torch.ones(1, 1, side, side), Disc().profile()
     sums = splat_spans(image, coc, profile, integrate=True)
     splatting = KernelSplatting(quality="exact")
-    off = [float((t - 1).abs().max()) for t in (sums, splatting(image, coc))]
-    yield _row("division by coverage", "a constant, radii that jump", *off)
+    found = [off(t, 1) for t in (sums, splatting(image, coc))]
+    yield _row("division by coverage", "a constant, radii that jump", *found)
     holes = splat_spans(image, even(side, side, 1e8).float(), profile, integrate=True)
     kept = splatting(image, even(side, side, 1e8).float())
     lost = torch.where(holes < bank_splatting.TINY, 0.0, holes / holes)
-    yield _row(
-        f"radii cut to {WIDEST:g} px",
-        "a constant, radius 1e8",
-        float((lost - 1).abs().max()),
-        float((kept - 1).abs().max()),
-    )
+    yield _row(f"radii cut to {WIDEST:g} px", "a constant, radius 1e8", off(lost, 1), off(kept, 1))
 
 
-def _reciprocals() -> Mechanism:
+def _reciprocals() -> Row:
     """The defocus equation as printed, and in reciprocal distances, for the sky: parts that are not finite."""
     depth, focus = torch.tensor([1.0, 1e20, math.inf]), 2.0
     printed, kept = (depth - focus) / depth / focus, 1 / focus - depth.reciprocal()
-    return _row(
-        "reciprocal distances", "CoC that is not finite", *(float((~t.isfinite()).sum()) for t in (printed, kept))
-    )
+    strange = [(~t.isfinite()).sum() for t in (printed, kept)]
+    return _row("reciprocal distances", "CoC that is not finite", *strange)
 
 
-def _confined(side: int) -> Mechanism:
+def _confined(side: int) -> Row:
     """Pixels of the buffer around a small picture whose ways are far longer than it is wide, in millions."""
     small, sizes = max(side // 4, 8), []
     way = torch.full((1, 2, small, small), 20.0 * small)

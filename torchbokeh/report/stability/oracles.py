@@ -15,23 +15,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.banks.splat import bank_of_motion
-from torchbokeh.compose.surfaces import CERTAIN, COARSE, FOREGROUND, bin_centres
+from torchbokeh import LensBlur, Plan, PsfBank
 from torchbokeh.ops.composite import TINY, pull_push
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.spans import Profile, area, subdivide
 from torchbokeh.ops.surface import BLEND
-from torchbokeh.picture.motion import ADVANCE, Motion, ways
-from torchbokeh.plan.plan import Plan
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import turned_capsule
 from torchbokeh.psfs.model import Labels
-from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.reconstruction import KNOWN
+from torchbokeh.report import internals
 from torchbokeh.report.stability.splats import dense_bank
-from torchbokeh.views.layers import STEPS
-from torchbokeh.views.points import Views
 
 
 class Part(NamedTuple):
@@ -82,7 +75,7 @@ def composed(
     blur: LensBlur,
     image: Tensor,
     coc: Tensor,
-    motion: Motion = None,
+    motion: internals.Displacements = None,
     shutter_depth: Tensor | None = None,
     background: tuple[Tensor, Tensor] | None = None,
 ) -> Tensor:
@@ -98,7 +91,8 @@ def composed(
     """
     limit = math.inf if blur.max_coc is None else blur.max_coc
     image, coc = image.double(), coc.double().clamp(-limit, limit)
-    steps = [way.double() for way in ways(motion)]
+    ways = [] if motion is None else [motion] if isinstance(motion, Tensor) else motion
+    steps = [way.double() for way in ways]
     ends = None if shutter_depth is None else shutter_depth.double().clamp(-limit, limit)
     behind = None if background is None else (background[0].double(), background[1].double().clamp(-limit, limit))
     if not image.numel():
@@ -117,7 +111,7 @@ def _by_plan(
     plan: Plan, blur: LensBlur, image: Tensor, coc: Tensor, parts: Parts, behind: tuple[Tensor, Tensor] | None
 ) -> Tensor:
     if image.dim() == 4 and parts and plan.uniform is not None:
-        return _panned(image, plan, ADVANCE[blur.shutter])
+        return _panned(image, plan, internals.ADVANCE[blur.shutter])
     sheets = _given(image, coc, parts, plan) if image.dim() == 5 else _split(image, coc, parts, plan, behind)
     if not sheets:
         return torch.zeros_like(image[:, 0])
@@ -154,7 +148,7 @@ def _spread(values: Tensor, coc: Tensor, parts: Parts, profile: Profile) -> Tens
     if not parts:
         return dense_spans(values, coc, profile)
     labels = [Labels(coc if p.coc is None else p.coc, motion=p.motion, offset=p.offset) for p in parts]
-    return dense_bank(values, labels, bank_of_motion(values.device))
+    return dense_bank(values, labels, internals.bank_of_motion(values.device))
 
 
 def over(
@@ -174,7 +168,7 @@ def over(
         votes: list[tuple[Tensor, Tensor, Tensor]] = []
         known = left
         for sheet, (mean, stopped, density) in zip(sheets, blurs, strict=True):
-            known = (CERTAIN * density).clamp(max=1)
+            known = (internals.CERTAIN * density).clamp(max=1)
             votes.append((left * stopped * known, mean, density))
             nothing = torch.zeros_like(left) if sheet.opaque else (sheet.alpha == 0).double()
             left = left * (known * (1 - stopped) + (1 - known) * nothing)
@@ -239,10 +233,10 @@ def gathered(image: Tensor, coc: Tensor, motion: Tensor | None, layers: int = 4)
     assert motion is not None
     image, coc, motion = image.double(), coc.double(), motion.double()
     source = torch.cat([image, torch.ones_like(coc)], 1)
-    centres = bin_centres(float(coc.min()), float(coc.max()), layers)
-    labels, bank = Labels(coc, motion=motion, offset=torch.zeros_like(motion)), bank_of_motion(image.device)
+    centres = internals.bin_centres(float(coc.min()), float(coc.max()), layers)
+    labels, bank = Labels(coc, motion=motion, offset=torch.zeros_like(motion)), internals.bank_of_motion(image.device)
     colour, coverage = filled([dense_bank(source * hat, [labels], bank) for hat in shares(coc, centres, 1.0)])
-    return pull_push(colour, (coverage / KNOWN).clamp(0, 1))
+    return pull_push(colour, (coverage / internals.KNOWN).clamp(0, 1))
 
 
 def viewed(layers: Tensor, coc: Tensor, views: int, motion: Tensor | None = None) -> Tensor:
@@ -261,13 +255,13 @@ def viewed(layers: Tensor, coc: Tensor, views: int, motion: Tensor | None = None
     parallax = [gone_on(fields[:, k], layers[:, k, 3:]) for k in held]
     y, x = torch.arange(height, dtype=torch.float64)[:, None], torch.arange(width, dtype=torch.float64)
     total = torch.zeros_like(layers[:, 0])
-    seen_from = Views.spread(views, Disc().profile())
+    seen_from = internals.Views.spread(views, Disc().profile())
     for (u, v), time in zip(seen_from.lens.double().tolist(), seen_from.time.double().tolist(), strict=True):
         left = torch.ones_like(total[:, 3:])
         for k, field in zip(held, parallax, strict=True):
             # A view moves a point by its CoC times the point of the lens: which one comes to lie on each pixel?
             found = field
-            for _ in range(STEPS):
+            for _ in range(internals.STEPS_OF_VIEWS):
                 column = x - found[:, 0] * u - found[:, 1] * time
                 row = y - found[:, 0] * v - found[:, 2] * time
                 found = _looked_up(field, row, column)
@@ -306,14 +300,16 @@ def _split(image: Tensor, coc: Tensor, parts: Parts, plan: Plan, behind: tuple[T
     """The picture, or what stands in front of its focus plane and the rest, with what is hidden filled in."""
     if len(plan.bins) == 1:
         return [Sheet(image, torch.ones_like(coc), coc, parts, plan.bins[0], opaque=True)]
-    start, stop = FOREGROUND
+    start, stop = internals.FOREGROUND
     front = ((stop - coc) / (stop - start)).clamp(0, 1)
     around = F.pad(front, (1, 1, 1, 1))
     height, width = coc.shape[2:]
     near = torch.stack([around[..., y : y + height, x : x + width] for y in range(3) for x in range(3)])
     known = 1 - near.amax(0)
     weight = torch.maximum(known, 1e-9 * (1 - front))
-    fill, fill_coc = _hidden(image, coc, weight, COARSE if plan.quality.coarse else 1) if behind is None else behind
+    fill, fill_coc = (
+        _hidden(image, coc, weight, internals.COARSE if plan.quality.coarse else 1) if behind is None else behind
+    )
 
     def rest(t: Tensor, hidden: Tensor) -> Tensor:
         return known * t + (1 - known) * hidden

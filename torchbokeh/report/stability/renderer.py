@@ -3,16 +3,21 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchbokeh.psfs.bank import PsfBank
+from torchbokeh import KernelSplatting, LensBlur, PsfBank
 from torchbokeh.psfs.model import Labels
 from torchbokeh.report.stability.cases import Case, reach_of
+from torchbokeh.report.stability.oracles import composed
 
 Run = Callable[[Tensor, Tensor, Tensor | None], Tensor]
+
+Inputs = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, dict[str, Any]]]
+"""What a part of this package is given for ``(image, coc, motion)``: the image, and all else by name."""
 
 WAY = (5.0, -3.0)
 """Motion in px where a renderer needs one and a case has none."""
@@ -92,6 +97,49 @@ class Renderer:
             return case.motion if self.moves else None
         way = torch.tensor(WAY, dtype=torch.float64).view(1, 2, 1, 1)
         return way.expand(len(case.image), 2, *case.image.shape[2:]).contiguous()
+
+
+def call_with(call: Callable[..., Any], inputs: Inputs, image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
+    """Call a part of this package with a picture."""
+    first, others = inputs(image, coc, motion)
+    return call(first, **others)
+
+
+def blur_renderer(name: str, kind: str, blur: LensBlur, inputs: Inputs, **more: Any) -> Renderer:
+    """A `LensBlur`: its oracle is `composed`, or itself in double where it merges or asks a bank."""
+    run, plan, slow = (partial(call_with, call, inputs) for call in (blur, blur.plan, partial(composed, blur)))
+    oracle, sums = (slow, None) if blur.quality == "exact" and kind != "bank" else (run, slow)
+    return Renderer(name, kind, run, oracle, plan, quality=blur.quality, sums=sums, **more)
+
+
+def splatting_renderer(name: str, kind: str, splatting: KernelSplatting, slow: Run, **more: Any) -> Renderer:
+    """A `KernelSplatting`: its oracle is ``slow``, or itself in double where it merges or asks a bank."""
+    run, plan = partial(call_with, splatting, picture), partial(call_with, splatting.plan, picture)
+    oracle, sums = (slow, None) if kind == "splat" else (run, slow)
+    return Renderer(name, kind, run, oracle, plan, quality=splatting.quality, sums=sums, **more)
+
+
+def picture(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """A picture and its CoC."""
+    return image, {"coc": coc}
+
+
+def moving(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """The same in motion."""
+    return image, {"coc": coc, "motion": motion}
+
+
+def layered(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """The two layers of `layers_of`."""
+    rgba, radius = layers_of(image, coc)
+    return rgba, {"coc": radius}
+
+
+def moving_layers(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """The same, moving in opposite ways."""
+    assert motion is not None
+    rgba, radius = layers_of(image, coc)
+    return rgba, {"coc": radius, "motion": torch.stack([motion, -motion], 1)}
 
 
 @lru_cache

@@ -5,51 +5,97 @@ Where a renderer does what its definition says but for rounding, the oracle is t
 two: itself in double, for rounding, and the definition, for the approximation.
 """
 
-from collections.abc import Callable, Iterator
-from functools import partial
+import math
+from collections.abc import Iterator
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+import torchbokeh
+from torchbokeh import AccumulationBuffer, ChromaticAccumulation, KernelSplatting, LensBlur
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.plan.quality import QUALITIES
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.renderers.kernel_splatting import KernelSplatting
-from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.reconstruction import Samples, pixel_positions, reconstruct
-from torchbokeh.report.stability.options import options
-from torchbokeh.report.stability.oracles import composed, gathered, splatted, viewed
-from torchbokeh.report.stability.renderer import VIEWS, Renderer, bank_of, layers_of
+from torchbokeh.report.internals import QUALITIES, pixel_positions
+from torchbokeh.report.stability.oracles import gathered, splatted, viewed
+from torchbokeh.report.stability.renderer import (
+    VIEWS,
+    Renderer,
+    bank_of,
+    blur_renderer,
+    call_with,
+    layered,
+    layers_of,
+    moving,
+    moving_layers,
+    picture,
+    splatting_renderer,
+)
+
+CUT_TO = 6.0
+"""``max_coc`` of the renderer that has one, in px."""
+
+MARGIN = 3
+"""Of the renderer that has one, in px."""
+
+TEXELS = 1.5 * math.sqrt(2) * 2 * math.sqrt(math.pi)
+"""How far a level of detail of 1 spreads light, as a share of the radius: a texel covers up to the area of the blur, or
+four times that of the level above, and is shared with its neighbours each way."""
+
+SPREAD = 3.0
+"""How far in px `dispersing` moves light, in radius and in place, at most."""
 
 
 def renderers() -> Iterator[Renderer]:
     """All of them."""
     for quality in QUALITIES:
-        splatting = KernelSplatting(quality=quality.name)
-        run, plan = partial(_still, splatting), partial(_still, splatting.plan)
-        kind, oracle, sums = ("splat", dense, None) if quality.merging is None else ("merged", run, dense)
-        yield Renderer(f"KernelSplatting, {quality.name}", kind, run, oracle, plan, quality=quality.name, sums=sums)
+        kind = "splat" if quality.merging is None else "merged"
+        name = f"KernelSplatting, {quality.name}"
+        yield splatting_renderer(name, kind, KernelSplatting(quality=quality.name), dense)
     for quality in QUALITIES:
-        blur, name = LensBlur(quality=quality.name), quality.name
-        for what, call, kind in (("image", _image, "composed"), ("layers", _layered, "layers")):
-            run, plan, slow = partial(call, blur), partial(call, blur.plan), partial(call, partial(composed, blur))
-            oracle, sums = (slow, None) if quality.merging is None else (run, slow)
-            yield Renderer(f"LensBlur {what}, {name}", kind, run, oracle, plan, quality=name, sums=sums)
-        run, plan, sums = partial(_moving, blur), partial(_moving, blur.plan), partial(_moving, partial(composed, blur))
-        more: dict[str, Any] = {"moves": True, "quality": name, "bank": "combined", "sums": sums}
-        yield Renderer(f"LensBlur motion, {name}", "bank", run, run, plan, **more)
+        blur = LensBlur(quality=quality.name)
+        yield blur_renderer(f"LensBlur image, {quality.name}", "composed", blur, picture)
+        yield blur_renderer(f"LensBlur layers, {quality.name}", "layers", blur, layered)
+        yield blur_renderer(f"LensBlur motion, {quality.name}", "bank", blur, moving, moves=True, bank="combined")
     for name in ("stylized", "physical-lens"):
-        splatting = KernelSplatting(quality="exact", bank=bank_of(name))
-        run, plan, sums = partial(_still, splatting), partial(_still, splatting.plan), partial(_banked, bank_of(name))
-        yield Renderer(f"KernelSplatting, bank {name}", "bank", run, run, plan, bank=name, sums=sums)
-    yield Renderer("AccumulationBuffer layers", "views", _views, _viewed)
+        bank = bank_of(name)
+        splatting, slow = KernelSplatting(quality="exact", bank=bank), lambda i, c, _, bank=bank: splatted(bank, i, c)
+        yield splatting_renderer(f"KernelSplatting, bank {name}", "bank", splatting, slow, bank=name)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS), layered)
+    yield Renderer("AccumulationBuffer layers", "views", run, lambda i, c, _: viewed(*layers_of(i, c), VIEWS))
     yield from options()
     yield Renderer("reconstruct", "samples", _samples, _samples, moves=True, bank="combined", sums=gathered)
+
+
+def options() -> Iterator[Renderer]:
+    """Renderers with the options that a user may set, one of each."""
+    for quality in ("exact", "balanced"):
+        for spectrum in ("rgb", "continuous"):
+            run, plan = partial(_coloured, spectrum, quality), partial(_coloured_plan, spectrum, quality)
+            name = f"LensBlur dispersion {spectrum}, {quality}"
+            yield Renderer(name, "colours", run, run, plan, widths=dispersed, quality=quality)
+        bank: dict[str, Any] = {"moves": True, "bank": "combined"}
+        blur = LensBlur(quality=quality)
+        yield blur_renderer(f"LensBlur approaching, {quality}", "bank", blur, _approaching, widths=_doubled, **bank)
+        blur = LensBlur(quality=quality, shutter="start")
+        yield blur_renderer(f"LensBlur curved motion, {quality}", "bank", blur, _curved, ahead=1.25, **bank)
+    yield blur_renderer("LensBlur 6-gon, exact", "composed", LensBlur(aperture="6-gon"), picture)
+    yield blur_renderer("LensBlur background, exact", "composed", LensBlur(), _background)
+    blur = LensBlur(margin=MARGIN, max_coc=CUT_TO, quality="balanced")
+    yield blur_renderer("LensBlur margin and max_coc, balanced", "composed", blur, _margin, widths=_cut)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1), layered)
+    yield Renderer("AccumulationBuffer layers, coarser and shared", "views", run, run, texels=TEXELS)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS, subsamples=4), layered)
+    yield Renderer("AccumulationBuffer layers, sub-samples", "rays", run, run)
+    run = partial(call_with, AccumulationBuffer(views=VIEWS), moving_layers)
+    yield Renderer("AccumulationBuffer layers, in motion", "views", run, _moving_viewed, moves=True)
+    for spectrum in ("rgb", "continuous"):
+        run = partial(_chromatic_views, spectrum)
+        yield Renderer(f"ChromaticAccumulation layers, {spectrum}", "views", run, run, widths=dispersed)
 
 
 def dense(image: Tensor, coc: Tensor, motion: Tensor | None = None) -> Tensor:
@@ -63,36 +109,6 @@ def coverage(coc: Tensor) -> Tensor:
     return dense_spans(torch.ones_like(coc), coc, Disc().profile())
 
 
-def _still(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc)
-
-
-def _image(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc)
-
-
-def _moving(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    return call(image, coc=coc, motion=motion)
-
-
-def _layered(call: Callable[..., Any], image: Tensor, coc: Tensor, motion: Tensor | None) -> Any:
-    rgba, radius = layers_of(image, coc)
-    return call(rgba, coc=radius)
-
-
-def _views(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    rgba, radius = layers_of(image, coc)
-    return AccumulationBuffer(views=VIEWS)(rgba, coc=radius)
-
-
-def _viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    return viewed(*layers_of(image, coc), VIEWS)
-
-
-def _banked(bank: PsfBank, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    return splatted(bank, image, coc)
-
-
 def _samples(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
     """Samples in the middle of their pixels, of the lens and of the exposure: a plain picture."""
     assert motion is not None
@@ -100,4 +116,70 @@ def _samples(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
     position = pixel_positions(image.to(compute_dtype(image))).expand(len(image), 2, *image.shape[2:])
     zero = torch.zeros_like(position)
     present = torch.ones_like(coc, dtype=torch.bool)
-    return reconstruct(Samples(*(t[:, None] for t in (image, position, zero, zero[:, :1], coc, motion, present))))
+    return torchbokeh.reconstruct(
+        torchbokeh.Samples(*(t[:, None] for t in (image, position, zero, zero[:, :1], coc, motion, present)))
+    )
+
+
+@lru_cache
+def dispersing(width: int, spectrum: str) -> torchbokeh.ThinLens:
+    """A lens that moves light by a px or two, whatever the width of the picture."""
+    dispersion = torchbokeh.Dispersion("BK7", axial=8.0, lateral=0.02, spectrum=spectrum)  # type: ignore[arg-type]
+    return torchbokeh.ThinLens(0.05, 1.0, 2.0, sensor_width=0.003 * width, dispersion=dispersion)
+
+
+def dispersed(coc: Tensor) -> tuple[Tensor, Tensor]:
+    """Radii that differ from those of a CoC by `SPREAD`."""
+    sign = torch.where(coc < 0, -1.0, 1.0).to(coc.dtype)
+    return sign * (coc.abs() - SPREAD).clamp_min(0), sign * (coc.abs() + SPREAD)
+
+
+def _coloured(spectrum: str, quality: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
+    out: Tensor = LensBlur(dispersing(image.shape[3], spectrum), quality=quality)(image, coc=coc)
+    return out
+
+
+def _coloured_plan(spectrum: str, quality: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> object:
+    return LensBlur(dispersing(image.shape[3], spectrum), quality=quality).plan(image, coc=coc)
+
+
+def _approaching(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc, "motion": motion, "shutter_depth": torch.cat([coc / 2, 2 * coc], 1)}
+
+
+def _doubled(coc: Tensor) -> tuple[Tensor, Tensor]:
+    return coc / 2, 2 * coc
+
+
+def _curved(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """Half of the motion, as much to its right, and a quarter of it back."""
+    assert motion is not None
+    right = torch.stack([-motion[:, 1], motion[:, 0]], 1)
+    return image, {"coc": coc, "motion": (motion / 2, right / 2, -motion / 4)}
+
+
+def _background(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc, "background": (image.flip(-1), coc.abs())}
+
+
+def _margin(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+    """The picture goes on beyond the sensor, with its last pixels."""
+    if image.numel():
+        image, coc = (F.pad(t, (MARGIN,) * 4, mode="replicate") for t in (image, coc))
+    return image, {"coc": coc}
+
+
+def _cut(coc: Tensor) -> tuple[Tensor, Tensor]:
+    cut = coc.clamp(-CUT_TO, CUT_TO)
+    return cut, cut
+
+
+def _moving_viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
+    assert motion is not None
+    return viewed(*layers_of(image, coc), VIEWS, torch.stack([motion, -motion], 1))
+
+
+def _chromatic_views(spectrum: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
+    buffer = ChromaticAccumulation(dispersing(image.shape[3], spectrum), views=VIEWS)
+    out: Tensor = call_with(buffer, layered, image, coc, motion)
+    return out

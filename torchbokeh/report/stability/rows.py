@@ -1,15 +1,19 @@
 """Lines of the tables of the stability report."""
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from torchbokeh.report.rows import Row
 from torchbokeh.report.stability.bounds import Precision
 from torchbokeh.report.stability.cases import Case
 
-Row = dict[str, Any]
+STRANGE = "not finite, or of another dtype"
+OUTSIDE = "outside of [min, max]"
+LEAK = "far-field leak"
+CONSTANT = "off the constant"
+"""What is measured in many places."""
 
 
 def row(renderer: str, case: Case | str, precision: str, what: str, measured: float, limit: float, **more: Any) -> Row:
@@ -38,11 +42,27 @@ def row(renderer: str, case: Case | str, precision: str, what: str, measured: fl
     }
 
 
-@contextlib.contextmanager
-def autocast(precision: Precision) -> Iterator[None]:
+def autocast(precision: Precision) -> torch.autocast:
     """As a user of mixed precision has it around the call."""
-    if precision.autocast is None:
-        yield
-        return
-    with torch.autocast("cpu", dtype=precision.autocast):
-        yield
+    return torch.autocast("cpu", dtype=precision.autocast, enabled=precision.autocast is not None)
+
+
+def strange(out: Tensor, dtype: torch.dtype) -> int:
+    """How many numbers are not finite, and one more if they are of another dtype."""
+    return int((~out.isfinite()).sum()) + (out.dtype != dtype)
+
+
+def outside(out: Tensor, low: Tensor | float, high: Tensor) -> Tensor:
+    """How far each number lies outside of a range."""
+    return torch.maximum(low - out, out - high).clamp_min(0)
+
+
+def worst(error: Tensor, limit: Tensor) -> tuple[float, float]:
+    """The error that is nearest to its limit, or farthest beyond it, and that limit."""
+    k = int((error / limit).nan_to_num(torch.inf).argmax())
+    return float(error.flatten()[k]), float(limit.flatten()[k])
+
+
+def off(out: Tensor, constant: Tensor | float) -> float:
+    """How far numbers are from a constant at most."""
+    return float((out - constant).abs().max())

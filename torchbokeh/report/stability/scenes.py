@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import torch
 
-from torchbokeh.lens import ThinLens
-from torchbokeh.lens.dispersion import Dispersion
-from torchbokeh.renderers.accumulation import AccumulationBuffer
-from torchbokeh.renderers.chromatic import ChromaticAccumulation
-from torchbokeh.report.stability.rows import Row, row
-from torchbokeh.scenes import RECIPES, Camera, Scene
+from torchbokeh import AccumulationBuffer, ChromaticAccumulation, Dispersion
+from torchbokeh.report.rows import Row
+from torchbokeh.report.scenes import with_dispersion
+from torchbokeh.report.stability.rows import STRANGE, outside, row, strange
+from torchbokeh.scenes import RECIPES, Scene
 
 CHOSEN = ("coins", "whirl", "sky")
 """Recipes: highlights at many depths, fast rotation, and a backdrop at infinity."""
@@ -29,18 +28,17 @@ def scene_rows(side: int) -> Iterator[Row]:
     for recipe in CHOSEN:
         scene, camera = RECIPES[recipe](0, (side, side * 3 // 2))
         assert scene.backdrop is not None
+        rgb, continuous = (
+            with_dispersion(camera, Dispersion("BK7", lateral=0.02, spectrum=spectrum))
+            for spectrum in ("rgb", "continuous")
+        )
+        shared = AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1)
         renderers = {
             "AccumulationBuffer scene": (AccumulationBuffer(views=VIEWS), camera),
-            "AccumulationBuffer scene, coarser and shared": (
-                AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1),
-                camera,
-            ),
+            "AccumulationBuffer scene, coarser and shared": (shared, camera),
             "AccumulationBuffer scene, sub-samples": (AccumulationBuffer(views=VIEWS, subsamples=4), camera),
-            "ChromaticAccumulation scene, rgb": (ChromaticAccumulation(views=VIEWS), _dispersing(camera, "rgb")),
-            "ChromaticAccumulation scene, continuous": (
-                ChromaticAccumulation(views=VIEWS),
-                _dispersing(camera, "continuous"),
-            ),
+            "ChromaticAccumulation scene, rgb": (ChromaticAccumulation(views=VIEWS), rgb),
+            "ChromaticAccumulation scene, continuous": (ChromaticAccumulation(views=VIEWS), continuous),
         }
         textures = [*(s.texture[:3] * s.emission for s in scene.sprites), scene.backdrop.texture]
         top = max(float(t.max()) for t in textures)
@@ -51,20 +49,12 @@ def scene_rows(side: int) -> Iterator[Row]:
             out = renderer(scene, seen_by)
             want = renderer(_in_double(scene), seen_by)
             here = (name, f"scene: {recipe}", "float32")
-            strange = int((~out.isfinite()).sum()) + (out.dtype != torch.float32)
-            yield row(*here, "not finite, or of another dtype", strange, 0)
+            yield row(*here, STRANGE, strange(out, torch.float32), 0)
             yield row(*here, "error", float((out - want).abs().max()), limit)
-            outside = torch.maximum(-out, out - top).clamp_min(0)
-            yield row(*here, "outside of [0, max]", float(outside.max()), limit)
+            yield row(*here, "outside of [0, max]", float(outside(out, 0.0, torch.tensor(top)).max()), limit)
 
 
 def _in_double(scene: Scene) -> Scene:
     assert scene.backdrop is not None
     sprites = tuple(replace(s, texture=s.texture.double()) for s in scene.sprites)
     return Scene(sprites, replace(scene.backdrop, texture=scene.backdrop.texture.double()))
-
-
-def _dispersing(camera: Camera, spectrum: str) -> Camera:
-    """The same camera with the glass of its lens."""
-    dispersion = Dispersion("BK7", lateral=0.02, spectrum=spectrum)  # type: ignore[arg-type]
-    return replace(camera, lens=ThinLens(*camera.lens.values().values(), dispersion=dispersion))

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchbokeh.banks.highlights import BRIGHT, _area, share_of_others, usual
-from torchbokeh.banks.splat import _confined, _far_beyond
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import lattice_green
@@ -23,6 +21,7 @@ from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels, Place
 from torchbokeh.psfs.represent import DOMAINS
+from torchbokeh.report.internals import BRIGHT, area_of_labels, confined, far_beyond, share_of_others, usual
 
 FINE = 2
 """Samples along each side of a pixel that the capsule of a highlight is drawn by (`torchbokeh.ops.capsules`)."""
@@ -42,14 +41,14 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
     Returns:
         ``(B, C, H, W)``, float64.
     """
-    extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
+    extreme = isinstance(bank.model, Combined) and far_beyond(values, parts)
     if not bool((values != 0).any()):
         return values
     values = values / len(parts)
-    seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
+    seen = [confined(values, part, 1) if extreme else (values, part) for part in parts]
     light = torch.stack([t for t, _ in seen]).mean(0)
     ordinary = usual(light)
-    bound = ordinary * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+    bound = ordinary * (BRIGHT * area_of_labels([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
     bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
     kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
     out = torch.zeros_like(values)
@@ -65,18 +64,6 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
         if bool(bright.any()):
             out = out + (capsules(lit, part) if isinstance(bank.model, Combined) else _pictured(lit, part, bank))
     return out
-
-
-def _within(values: Tensor, part: Labels) -> tuple[Tensor, Labels]:
-    """Discs that cover the whole picture all the time are even there, and so are as good as smaller ones at rest."""
-    assert part.coc is not None
-    zero = torch.zeros_like(values[:, :2])
-    motion, offset = (zero if t is None else t for t in (part.motion, part.offset))
-    radius, diagonal = part.coc.abs(), math.hypot(*values.shape[2:]) + 1
-    wide = radius > diagonal + motion.norm(dim=1, keepdim=True) / 2 + offset.norm(dim=1, keepdim=True)
-    values = torch.where(wide, values * (diagonal / radius.clamp_min(1.0)).square(), values)
-    motion, offset = (torch.where(wide, 0.0, t) for t in (motion, offset))
-    return values, Labels(torch.where(wide, diagonal, part.coc), part.depth, motion, offset, part.field)
 
 
 def dense_samples(values: Tensor, labels: Labels, bank: PsfBank) -> Tensor:

@@ -6,16 +6,14 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchbokeh.lens import ThinLens
-from torchbokeh.lens.dispersion import FEWEST, SEEN, Dispersion, Spectrum
+from torchbokeh import Dispersion, KernelSplatting, LensBlur, ThinLens
 from torchbokeh.ops.merge import FADE, STEPS
-from torchbokeh.plan.quality import QUALITIES
-from torchbokeh.renderers.kernel_splatting import KernelSplatting
-from torchbokeh.renderers.lens_blur import LensBlur
+from torchbokeh.report.internals import FEWEST, QUALITIES, SEEN, Spectrum
+from torchbokeh.report.rows import Row
 from torchbokeh.report.stability.bounds import lipschitz
 from torchbokeh.report.stability.cases import slope, texture
 from torchbokeh.report.stability.renderers import coverage
-from torchbokeh.report.stability.rows import Row, row
+from torchbokeh.report.stability.rows import off, row
 
 STEP = 1 / STEPS
 """Change of all radii in px: that of merged ones in cells, so that each step shows."""
@@ -47,7 +45,7 @@ def sweep_rows(side: int) -> Iterator[Row]:
         for radius in dict.fromkeys(radii):
             coc = slope(side, side, radius, radius)
             near = [blur(image, coc + k * STEP) for k in (-2, -1, 0, 1, 2)]
-            change = max(float((b - a).abs().max()) for a, b in pairwise(near))
+            change = max(off(b, a) for a, b in pairwise(near))
             step = STEP
             fade = 0.0
             if merging is not None:
@@ -95,7 +93,7 @@ def plan_rows(side: int, width: float = 1e-5) -> Iterator[Row]:
     for quality in QUALITIES:
         blur = LensBlur(quality=quality.name)
         for name, picture in changes.items():
-            worst = float((picture(blur, -width) - picture(blur, width)).abs().max())
+            worst = off(picture(blur, -width), picture(blur, width))
             limit = 2 * width * STEEPEST * float(image.max() - image.min())
             case = f"change of plan: {name}"
             yield row(f"LensBlur image, {quality.name}", case, "float64", "largest change", worst, limit)
@@ -129,5 +127,4 @@ def _colour_row(blur: LensBlur, image: Tensor, depth: Tensor, spectrum: Spectrum
     before, after = (with_axial(high * (1 + s))(image, depth) for s in (-width, width))
     limit = 2 * width * border * STEEPEST * float(image.max() - image.min())
     case = f"change of plan: {spectrum} colours from {border:g} px"
-    worst = float((before - after).abs().max())
-    return row(f"LensBlur image, {blur.quality}", case, "float64", "largest change", worst, limit)
+    return row(f"LensBlur image, {blur.quality}", case, "float64", "largest change", off(before, after), limit)

@@ -1,7 +1,7 @@
 import torch
 
+from torchbokeh.report.internals import QUALITY_NAMES
 from torchbokeh.report.motion.experiments import DENSE, DENSE_LAYERS, FILTER, RECIPES_IN_MOTION, spinning
-from torchbokeh.report.speed.methods import QUALITIES
 
 
 def test_the_picture_turns():
@@ -14,7 +14,7 @@ def test_the_picture_turns():
 
 def test_every_quality_is_compared_with_the_dense_scatter(report):
     rows = {row["method"]: row for row in report["experiments"]["motion"]}
-    assert set(rows) == {DENSE, *(f"bank, {q}" for q in QUALITIES), "bank, exact, interpolated"}
+    assert set(rows) == {DENSE, *(f"bank, {q}" for q in QUALITY_NAMES), "bank, exact, interpolated"}
     assert rows[DENSE]["l1"] == 0
     assert rows[DENSE]["times_dense"] == 1
     for name, row in rows.items():

@@ -17,28 +17,26 @@ pytest.importorskip("matplotlib")
 import torchbokeh.commands.psfs
 import torchbokeh.report.psfs.analysis
 import torchbokeh.report.psfs.splats
-import torchbokeh.report.psfs.tables
 from torchbokeh.commands.psfs import add_psfs
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.quadtree import quadtree
 from torchbokeh.psfs.refit import reconstruction
 from torchbokeh.psfs.similarity import centred
+from torchbokeh.report import chapters
 from torchbokeh.report.psfs.analysis import (
     METHODS,
     SHARES,
     Elimination,
-    Settings,
-    analyse,
+    PsfSettings,
     covers,
     equal_sparsity,
     gaussian,
     leaves,
     quality,
-    quick,
     random_psfs,
 )
-from torchbokeh.report.psfs.plots import draw
+from torchbokeh.report.psfs.chapter import analyse, draw, markdown
 from torchbokeh.report.psfs.splats import (
     beyond,
     both,
@@ -52,7 +50,6 @@ from torchbokeh.report.psfs.splats import (
     values_at,
     with_cells,
 )
-from torchbokeh.report.psfs.tables import markdown, write_analysis
 
 PSF = capsule(6.0, 9.0)
 
@@ -63,7 +60,7 @@ def silent(line):
 
 @pytest.fixture(scope="module")
 def found():
-    return analyse(quick(), silent)
+    return analyse(PsfSettings.quick(), silent)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +86,7 @@ def run(*flags):
     args.run(args)
 
 
-@pytest.mark.parametrize("module", [getattr(torchbokeh.report.psfs, name) for name in ("analysis", "splats", "tables")])
+@pytest.mark.parametrize("module", [getattr(torchbokeh.report.psfs, name) for name in ("analysis", "splats")])
 def test_examples(module):
     tried = doctest.testmod(module)
     assert tried.attempted
@@ -97,7 +94,7 @@ def test_examples(module):
 
 
 def test_a_quick_analysis_is_written_whole(found, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(torchbokeh.report.psfs.analysis, "analyse", lambda settings, say: found)
+    monkeypatch.setattr(chapters, "PSFS", chapters.PSFS._replace(run=lambda settings, say: found))
     run("--quick", "--out", str(tmp_path / "new"))
     written = capsys.readouterr().out.split()
     assert sorted(written) == sorted(str(path) for path in (tmp_path / "new").iterdir())
@@ -110,26 +107,26 @@ def test_a_quick_analysis_is_written_whole(found, tmp_path, capsys, monkeypatch)
 
 def test_every_experiment_has_rows(found):
     assert all(found["experiments"].values())
-    assert found["settings"] == quick().row()
+    assert found["settings"] == PsfSettings.quick().row()
 
 
 def test_what_is_not_reached_is_a_dash(found):
     rows = {**found["experiments"], "large": [{**found["experiments"]["large"][0], "ssim": None}]}
-    assert "| - |" in markdown({**found, "experiments": rows})
+    assert "| - |" in markdown({**found, "experiments": rows}, [])
 
 
 def test_axes_are_named(found):
-    for figure in draw(found["experiments"]).values():
+    for figure in draw(found).values():
         assert all(axes.get_xlabel() for axes in figure.axes if axes.get_label() != "<colorbar>")
 
 
 def test_flags_choose_settings(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(torchbokeh.report.psfs.analysis, "analyse", lambda settings, say: asked.append(settings))
-    monkeypatch.setattr(torchbokeh.report.psfs.tables, "write_analysis", lambda found, folder: [])
+    run_only = {"run": lambda settings, say: asked.append(settings), "draw": lambda found: {}}
+    monkeypatch.setattr(chapters, "PSFS", chapters.PSFS._replace(**run_only, markdown=lambda found, plots: ""))
     run("--out", str(tmp_path))
     run("--out", str(tmp_path), "--quick")
-    assert asked == [Settings(), quick()]
+    assert asked == [PsfSettings(), PsfSettings.quick()]
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
@@ -146,7 +143,11 @@ def test_the_extra_is_asked_for_where_it_is_missing(monkeypatch):
 
 def test_an_earlier_analysis_is_replaced(found, tmp_path):
     (tmp_path / "psfs.md").write_text("old")
-    assert write_analysis(found, tmp_path)[0].read_text(encoding="utf-8").startswith("# Sparse PSFs")
+    assert (
+        chapters.write_chapter(chapters.PSFS, found, tmp_path)[0]
+        .read_text(encoding="utf-8")
+        .startswith("# Sparse PSFs")
+    )
 
 
 def test_random_psfs_cover_what_is_asked_and_are_the_same_again():

@@ -1,8 +1,8 @@
 import torch
 
+from torchbokeh.report.internals import QUALITY_NAMES
 from torchbokeh.report.scenes import photo, special
 from torchbokeh.report.speed.blur import INPUTS, slabs
-from torchbokeh.report.speed.methods import QUALITIES
 
 
 def test_slabs_are_the_picture_in_layers():
@@ -20,7 +20,7 @@ def test_every_input_and_quality_is_held_against_truth_and_exact(report):
     found = report["experiments"]["truth"]
     assert {row["scene"] for row in found} == {"coins"}
     kinds = {(row["input"], row["quality"]) for row in found}
-    assert kinds >= {(given, quality) for given in ("one layer", *INPUTS) for quality in QUALITIES}
+    assert kinds >= {(given, quality) for given in ("one layer", *INPUTS) for quality in QUALITY_NAMES}
     assert found[0]["input"] == "truth"
     for row in found[1:]:
         assert 0 < row["ssim_truth"] < 1

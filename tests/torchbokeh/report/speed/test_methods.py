@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from torchbokeh.report.speed.methods import QUALITIES, Method, own_methods, own_name
+from torchbokeh.report.internals import QUALITY_NAMES
+from torchbokeh.report.speed.methods import Method, own_methods, own_name
 
 
 def method(**settings):
@@ -9,10 +10,10 @@ def method(**settings):
 
 
 def test_own_methods_are_the_qualities():
-    assert list(own_methods()) == [own_name(quality) for quality in QUALITIES]
+    assert list(own_methods()) == [own_name(quality) for quality in QUALITY_NAMES]
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("quality", QUALITY_NAMES)
 def test_own_methods_blur_one_layer(quality):
     image, coc = torch.full((1, 3, 24, 32), 0.5), torch.linspace(-6, 6, 32).expand(1, 1, 24, 32).contiguous()
     own = own_methods()[own_name(quality)]

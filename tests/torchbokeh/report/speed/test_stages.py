@@ -41,7 +41,7 @@ def test_a_stage_that_is_not_always_there_counts_as_nothing():
 def test_every_quality_and_radius_has_its_stages(tiny):
     rows = stages(tiny, lambda line: None)
     assert {(row["quality"], row["radius"]) for row in rows} == {
-        (quality, radius) for quality in module.QUALITIES for radius in tiny.photo_radii
+        (quality, radius) for quality in module.QUALITY_NAMES for radius in tiny.photo_radii
     }
     assert rows[0].keys() == {"quality", "radius", "stage", "seconds", "share", "least_seconds"}
     bounded = [row for row in rows if row["least_seconds"] is not None]
