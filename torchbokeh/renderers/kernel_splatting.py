@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from torchbokeh.banks.splat import bank_labels, blur_with_bank, needed
+from torchbokeh.banks.splat import bank_labels, blur_with_bank
 from torchbokeh.ops.checks import check_flag, check_image
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.convolve import CONVOLVE_FROM, blur_uniform
@@ -206,7 +206,7 @@ class KernelSplatting(nn.Module):
             elif plan.uniform is not None and not asked:
                 out = blur_uniform(source, plan.uniform, profile)
             else:
-                out = blur_one_layer(source, needed(labels), profile, plan.quality.merging, plan.highest)
+                out = blur_one_layer(source, labels.required_coc(), profile, plan.quality.merging, plan.highest)
         return out.to(image.dtype)
 
     def _labels(self, image: Tensor, coc: Tensor | None, depth: Tensor | None, motion: Tensor | None) -> Labels:
