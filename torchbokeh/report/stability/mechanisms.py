@@ -20,7 +20,7 @@ from torchbokeh.ops.integrate import laplacian, poisson_fft
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.picture.coc import WIDEST
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.combined import capsule
+from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import drawn
 from torchbokeh.renderers.kernel_splatting import KernelSplatting
 from torchbokeh.report.stability.cases import even, slope
@@ -185,6 +185,6 @@ def _confined(side: int) -> Mechanism:
 
     with mock.patch.object(bank_samples, "poisson_fft", integrated):
         for extreme in (False, True):
-            with mock.patch.object(bank_splatting, "_far_beyond", lambda *_, found=extreme: found):
+            with mock.patch.object(Combined, "needs_clipping", lambda *_, found=extreme: found):
                 KernelSplatting(quality="exact", bank=bank_of("combined"))(image, coc, motion=way)
     return _row("ways no longer than the picture asks for", f"Mpx of a buffer, {small} x {small} px", *sizes)

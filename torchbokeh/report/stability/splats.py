@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchbokeh.banks.highlights import BRIGHT, _area, share_of_others, usual
-from torchbokeh.banks.splat import _confined, _far_beyond
+from torchbokeh.banks.highlights import BRIGHT, ordinary_brightness, share_of_others
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import lattice_green
@@ -42,14 +41,14 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
     Returns:
         ``(B, C, H, W)``, float64.
     """
-    extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
+    extreme = bank.model.needs_clipping(parts, (values.shape[2], values.shape[3]))
     if not bool((values != 0).any()):
         return values
     values = values / len(parts)
-    seen = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
+    seen = [bank.model.clipped(values, part, 1) if extreme else (values, part) for part in parts]
     light = torch.stack([t for t, _ in seen]).mean(0)
-    ordinary = usual(light)
-    bound = ordinary * (BRIGHT * _area([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+    ordinary = ordinary_brightness(light)
+    bound = ordinary * (BRIGHT * bank.model.area([part for _, part in seen], bank.reach())).clamp_min(LEAST_CONTRAST)
     bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
     kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
     out = torch.zeros_like(values)
