@@ -76,8 +76,9 @@ class PsfBank(nn.Module):
             raise TypeError(f"info: expected a dict or None, got {type(info).__name__}")
         if len(samples) != len(model.grid):
             raise ValueError(f"samples: expected {len(model.grid)} for {model.name}, got {len(samples)}")
-        sparse = [s.sparse for s in samples]
-        self._fill(model, info, _tensors(sparse, [DOMAINS.index(s.domain) for s in samples], torch.int16))
+        offsets, values = ([s.sparse[k] for s in samples] for k in (0, 1))
+        domains = torch.tensor([DOMAINS.index(s.domain) for s in samples], dtype=torch.uint8)
+        self._fill(model, info, _points(offsets, values, torch.int16) | {"domains": domains})
 
     def _fill(self, model: PsfModel, info: dict[str, Any] | None, tensors: dict[str, Tensor]) -> "PsfBank":
         super().__init__()
@@ -125,16 +126,18 @@ class PsfBank(nn.Module):
             used: ``(K,)`` bool; the other samples are left without points.
             fine: points along each side of a pixel, for PSFs that are turned or enlarged.
         """
-        samples = [Sparse(np.zeros((0, 2)), np.zeros((0, self.values.shape[1])))] * len(self)
+        offsets = [np.zeros((0, 2))] * len(self)
+        values = [np.zeros((0, self.values.shape[1]))] * len(self)
         steps = (np.arange(fine) + 0.5) / fine - 0.5
         for number in used.nonzero()[:, 0].tolist():
             picture = self._picture(number)
             y, x = np.nonzero((picture > 0).any(0))
             place = np.stack([x - picture.shape[2] // 2, y - picture.shape[1] // 2], 1)
-            points = [place + np.array([dx, dy]) for dy in steps for dx in steps]
-            samples[number] = Sparse(np.concatenate(points), np.tile(picture[:, y, x].T / fine**2, (fine**2, 1)))
+            offsets[number] = np.concatenate([place + np.array([dx, dy]) for dy in steps for dx in steps])
+            values[number] = np.tile(picture[:, y, x].T / fine**2, (fine**2, 1))
         with torch.inference_mode(False):
-            tensors = _tensors(samples, [DOMAINS.index("direct")] * len(self), torch.float32)
+            direct = torch.full((len(self),), DOMAINS.index("direct"), dtype=torch.uint8)
+            tensors = _points(offsets, values, torch.float32) | {"domains": direct}
             return PsfBank.__new__(PsfBank)._fill(self.model, self.info, tensors).to(self.values.device)
 
     def _picture(self, number: int) -> NDArray[np.float64]:
@@ -247,12 +250,13 @@ def installed() -> list[str]:
     return [name for name in MODELS if (BANKS / f"{name}.safetensors").is_file()]
 
 
-def _tensors(samples: Sequence[Sparse], domains: Sequence[int], dtype: torch.dtype) -> dict[str, Tensor]:
-    """The buffers of a `PsfBank`, with offsets of a dtype."""
-    offsets, values = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*samples, strict=True))
-    counts = torch.tensor([0, *np.cumsum([len(s.points) for s in samples])], dtype=torch.int32)
-    found = offsets.to(dtype), values.float(), counts, torch.tensor(domains, dtype=torch.uint8)
-    return dict(zip(_DTYPES, found, strict=True))
+def _points(offsets: Sequence[NDArray], values: Sequence[NDArray], dtype: torch.dtype) -> dict[str, Tensor]:
+    """The points of all samples as the buffers of a `PsfBank`, with offsets of a dtype."""
+    return {
+        "offsets": torch.from_numpy(np.concatenate(offsets)).to(dtype),
+        "values": torch.from_numpy(np.concatenate(values)).float(),
+        "counts": torch.tensor([0, *np.cumsum([len(v) for v in values])], dtype=torch.int32),
+    }
 
 
 def _grid_of(model: PsfModel) -> list[list[float]]:

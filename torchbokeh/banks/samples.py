@@ -99,10 +99,8 @@ def splat_samples(sources: Sequence[Source], settings: BankSettings, size: int =
     for number, domain in enumerate(DOMAINS):
         here = [(c, u & (bank.domains == number)) for c, u in zip(chosen, used, strict=True)]
         here = [(c, u) for c, u in here if bool(u.any())]
-        if not here:
-            continue
-        pad = _padding([(c.place, float(reach[u].max())) for c, u in here], canvas)
-        buffer = None
+        pad = _padding([(c.place, float(reach[u].max())) for c, u in here], canvas) if here else 0
+        buffer: Tensor | None = None
         for c, _ in here:
             weights = _weights(c, bank, domain)
             size_there = None if c.position is None else canvas
@@ -111,7 +109,8 @@ def splat_samples(sources: Sequence[Source], settings: BankSettings, size: int =
             parts = [splat(weights[:, k::colours], c.numbers, bank.table(domain, k)) for k in range(colours)]
             part = parts[0] if colours == 1 else torch.stack(parts, 2).flatten(1, 2)
             buffer = part if buffer is None else buffer + part
-        out = out + _INTEGRALS[domain](buffer)[..., pad : pad + canvas[0], pad : pad + canvas[1]]
+        if buffer is not None:
+            out = out + _INTEGRALS[domain](buffer)[..., pad : pad + canvas[0], pad : pad + canvas[1]]
     return out
 
 
