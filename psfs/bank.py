@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchbokeh.ops.checks import check_kind
 from torchbokeh.ops.points import PointTable
 from torchbokeh.ops.system.files import replacing
 from torchbokeh.psfs.model import FRAME, PsfModel
@@ -68,24 +69,26 @@ class PsfBank(nn.Module):
     domains: Tensor
 
     def __init__(self, model: PsfModel, samples: Sequence[Represented], info: dict[str, Any] | None = None) -> None:
-        super().__init__()
-        if not isinstance(model, PsfModel):
-            raise TypeError(f"model: expected a PsfModel, got {type(model).__name__}")
+        check_kind("model", model, PsfModel)
         if not isinstance(samples, Sequence) or not all(isinstance(s, Represented) for s in samples):
             raise TypeError(f"samples: expected a sequence of Represented, got {type(samples).__name__}")
         if info is not None and not isinstance(info, dict):
             raise TypeError(f"info: expected a dict or None, got {type(info).__name__}")
         if len(samples) != len(model.grid):
             raise ValueError(f"samples: expected {len(model.grid)} for {model.name}, got {len(samples)}")
+        offsets, values = ([s.sparse[k] for s in samples] for k in (0, 1))
+        domains = torch.tensor([DOMAINS.index(s.domain) for s in samples], dtype=torch.uint8)
+        self._fill(model, info, _points(offsets, values, torch.int16) | {"domains": domains})
+
+    def _fill(self, model: PsfModel, info: dict[str, Any] | None, tensors: dict[str, Tensor]) -> "PsfBank":
+        super().__init__()
         self.model = model
         self.info = dict(info or {})
         self._tables: dict[tuple[Domain, int, torch.device], PointTable] = {}
         self._pictures: dict[int, NDArray[np.float64]] = {}
-        sizes = [len(s.sparse.points) for s in samples]
-        self.register_buffer("offsets", torch.from_numpy(np.concatenate([s.sparse.points for s in samples])).short())
-        self.register_buffer("values", torch.from_numpy(np.concatenate([s.sparse.values for s in samples])).float())
-        self.register_buffer("counts", torch.tensor([0, *np.cumsum(sizes)], dtype=torch.int32))
-        self.register_buffer("domains", torch.tensor([DOMAINS.index(s.domain) for s in samples], dtype=torch.uint8))
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor)
+        return self
 
     def __len__(self) -> int:
         """The number of samples."""
@@ -98,10 +101,8 @@ class PsfBank(nn.Module):
     def sample(self, number: int) -> Represented:
         """One sample as it was built, its values rounded to float32."""
         first, last = self.counts[number : number + 2].tolist()
-        points = self.offsets[first:last].cpu().numpy().astype(np.int64)
-        return Represented(
-            DOMAINS[int(self.domains[number])], Sparse(points, self.values[first:last].cpu().double().numpy())
-        )
+        points, values = self.offsets[first:last].cpu().long().numpy(), self.values[first:last].cpu().double().numpy()
+        return Represented(DOMAINS[int(self.domains[number])], Sparse(points, values))
 
     def table(self, domain: Domain, channel: int = 0) -> PointTable:
         """The points of one domain as a table of all samples, for `torchbokeh.ops.points.splat_points`.
@@ -125,24 +126,19 @@ class PsfBank(nn.Module):
             used: ``(K,)`` bool; the other samples are left without points.
             fine: points along each side of a pixel, for PSFs that are turned or enlarged.
         """
-        offsets, values, sizes = [np.zeros((0, 2))], [np.zeros((0, self.values.shape[1]))], np.zeros(len(self), int)
+        offsets = [np.zeros((0, 2))] * len(self)
+        values = [np.zeros((0, self.values.shape[1]))] * len(self)
         steps = (np.arange(fine) + 0.5) / fine - 0.5
         for number in used.nonzero()[:, 0].tolist():
             picture = self._picture(number)
             y, x = np.nonzero((picture > 0).any(0))
             place = np.stack([x - picture.shape[2] // 2, y - picture.shape[1] // 2], 1)
-            offsets += [place + np.array([dx, dy]) for dy in steps for dx in steps]
-            values += [picture[:, y, x].T / fine**2] * fine**2
-            sizes[number] = len(place) * fine**2
-        bank = PsfBank.__new__(PsfBank)
-        nn.Module.__init__(bank)
-        bank.model, bank.info, bank._tables, bank._pictures = self.model, self.info, {}, {}
+            offsets[number] = np.concatenate([place + np.array([dx, dy]) for dy in steps for dx in steps])
+            values[number] = np.tile(picture[:, y, x].T / fine**2, (fine**2, 1))
         with torch.inference_mode(False):
-            bank.register_buffer("offsets", torch.from_numpy(np.concatenate(offsets)).float())
-            bank.register_buffer("values", torch.from_numpy(np.concatenate(values)).float())
-            bank.register_buffer("counts", torch.tensor([0, *np.cumsum(sizes)], dtype=torch.int32))
-            bank.register_buffer("domains", torch.zeros(len(self), dtype=torch.uint8))
-        return bank.to(self.values.device)
+            direct = torch.full((len(self),), DOMAINS.index("direct"), dtype=torch.uint8)
+            tensors = _points(offsets, values, torch.float32) | {"domains": direct}
+            return PsfBank.__new__(PsfBank)._fill(self.model, self.info, tensors).to(self.values.device)
 
     def _picture(self, number: int) -> NDArray[np.float64]:
         """What the points of a sample integrate to, within their reach: ``(C, h, w)``, centred, >= 0."""
@@ -164,9 +160,11 @@ class PsfBank(nn.Module):
     def reach(self) -> Tensor:
         """Largest distance ``(K,)`` in px of a point of each sample from its centre, along x or y."""
         far = self.offsets.float().abs().amax(1)
-        found = far.new_zeros(len(self))
-        owner = torch.arange(len(self), device=far.device).repeat_interleave(self.counts.diff())
-        return found.scatter_reduce(0, owner, far, "amax")
+        return far.new_zeros(len(self)).scatter_reduce(0, self._owners(), far, "amax")
+
+    def _owners(self) -> Tensor:
+        """The sample ``(P,)`` of each point."""
+        return torch.arange(len(self), device=self.counts.device).repeat_interleave(self.counts.diff())
 
     @cached_property
     def extents(self) -> Tensor:
@@ -182,7 +180,7 @@ class PsfBank(nn.Module):
         their second moment in the Laplacian domain, since the Laplacian of ``x**2 + y**2`` is 4.
         """
         x, y = self.offsets.double().unbind(1)
-        owner = torch.arange(len(self), device=x.device).repeat_interleave(self.counts.diff())
+        owner = self._owners()
         factors = torch.stack([torch.ones_like(x), -x, (x * x + y * y) / 4])
         factor = factors.gather(0, self.domains.long()[owner][None])[0]
         sums = self.values.new_zeros(len(self), self.values.shape[1], dtype=torch.float64)
@@ -244,17 +242,21 @@ class PsfBank(nn.Module):
             raise ValueError(f"{path}: its samples stand elsewhere than those of this version's model {model.name!r}")
         if (len(tensors["domains"]), tensors["values"].shape[1]) != (len(model.grid), model.channels):
             raise ValueError(f"{path}: expected {len(model.grid)} samples of {model.channels} channels, got others")
-        bank = cls.__new__(cls)
-        nn.Module.__init__(bank)
-        bank.model, bank.info, bank._tables, bank._pictures = model, head["info"], {}, {}
-        for name, tensor in tensors.items():
-            bank.register_buffer(name, tensor)
-        return bank
+        return cls.__new__(cls)._fill(model, head["info"], tensors)
 
 
 def installed() -> list[str]:
     """Models whose banks come with the package."""
     return [name for name in MODELS if (BANKS / f"{name}.safetensors").is_file()]
+
+
+def _points(offsets: Sequence[NDArray], values: Sequence[NDArray], dtype: torch.dtype) -> dict[str, Tensor]:
+    """The points of all samples as the buffers of a `PsfBank`, with offsets of a dtype."""
+    return {
+        "offsets": torch.from_numpy(np.concatenate(offsets)).to(dtype),
+        "values": torch.from_numpy(np.concatenate(values)).float(),
+        "counts": torch.tensor([0, *np.cumsum([len(v) for v in values])], dtype=torch.int32),
+    }
 
 
 def _grid_of(model: PsfModel) -> list[list[float]]:
@@ -306,13 +308,12 @@ def _check(path: Path, head: dict[str, Any], tensors: dict[str, Tensor]) -> None
         raise ValueError(f"{path}: the data was changed since it was written: its digest is another")
     offsets, values, counts, domains = (tensors[name] for name in _DTYPES)
     fits = (
-        offsets.dim() == values.dim() == 2
-        and offsets.shape == (len(values), 2)
+        values.dim() == 2
         and values.shape[1] in (1, 3)
-        and counts.shape == (len(domains) + 1,)
+        and offsets.shape == (len(values), 2)
         and domains.dim() == 1
-        and int(counts[0]) == 0
-        and int(counts[-1]) == len(values)
+        and counts.shape == (len(domains) + 1,)
+        and counts[[0, -1]].tolist() == [0, len(values)]
         and bool((counts.diff() >= 0).all())
         and bool((domains < len(DOMAINS)).all())
         and bool(((offsets >= -FARTHEST) & (offsets <= FARTHEST)).all())

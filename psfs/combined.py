@@ -1,7 +1,7 @@
 """`Combined`: a disc in linear motion, in closed form (LKS table 1)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
@@ -9,7 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.ops.checks import check_number
+from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.model import FRAME, Axis, Labels, Place, PsfModel, gaussian, mean_picture, scaled, turned
 
@@ -30,6 +32,9 @@ STILL = (0.5, 1.5)
 
 ROWS = (8, 32)
 """Least and most rows of the quadrature across a pixel; small discs need more."""
+
+ALONG = 64
+"""Discs that the support of a moving one is made up of, at most."""
 
 
 def capsule(radius: float, length: float) -> NDArray[np.float64]:
@@ -186,7 +191,7 @@ class Combined(PsfModel):
 
     def still(self, labels: Labels) -> Tensor | None:
         """What does not move is a disc; between the lengths of `STILL`, it is partly one."""
-        if labels.motion is None:
+        if labels.coc is None or labels.motion is None:
             return None
         start, stop = STILL
         share = torch.ones_like(labels.motion[:, :1])
@@ -201,7 +206,7 @@ class Combined(PsfModel):
         if labels.coc is None or labels.motion is None:
             return [self.place(labels)]
         coc, motion = labels.coc / size, labels.motion / size
-        length = motion.detach().square().sum(1, keepdim=True).sqrt()
+        length = _length(motion.detach())
         longest = self.axes[1].bound * (coc.detach().abs() / (self.axes[0].bound + MIN_RADIUS)).clamp_min(1.0)
         count = (length / longest).ceil().clamp_min(1.0)
         most = int(count.max()) if count.numel() else 1
@@ -213,6 +218,76 @@ class Combined(PsfModel):
             step = (number + 0.5) / count - 0.5
             found.append(piece._replace(offset=step * motion, share=(number < count) / count))
         return found
+
+    def area(self, parts: Sequence[Labels], reach: Tensor) -> Tensor:
+        """That of a capsule of the mean radius and length."""
+        radius = torch.stack([part.required_coc().abs().clamp_min(MIN_RADIUS) for part in parts]).mean(0)
+        length = torch.stack([_length(_path(part)[0]) for part in parts]).sum(0)
+        return radius * (math.pi * radius + 2 * length) / len(parts)
+
+    def support(self, labels: Labels, reach: Tensor, pixels: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Discs along the motion, about as far apart as they are wide."""
+        radius = labels.required_coc().abs().float()
+        motion, offset = (t.float() for t in _path(labels))
+        length = _length(motion)
+        count = min(1 + math.ceil(float((length / radius.clamp_min(1.0))[pixels].max())), ALONG)
+        step = length / max(count - 1, 1)
+        cover = (radius.square() + step.square() / 4).sqrt() + 1
+        for k in range(count):
+            yield offset + (k / max(count - 1, 1) - 0.5) * motion, cover
+
+    def splat_exactly(self, values: Tensor, labels: Labels, pixels: Tensor) -> Tensor:
+        """Each capsule in closed form."""
+        maps = (labels.required_coc(), *_path(labels))
+        coc, motion, offset = (t.movedim(1, -1).flatten(0, 2)[pixels] for t in maps)
+        return splat_capsules(values, pixels, coc[:, 0].abs(), motion, offset)
+
+    def needs_clipping(self, parts: Sequence[Labels], size: tuple[int, int]) -> bool:
+        """Where a motion or a disc is longer than the diagonal, so that its buffer would be as large as it."""
+        maps = [t for part in parts for t in (part.required_coc(), part.motion, part.offset) if t is not None]
+        return bool(torch.stack([t.detach().square().sum(1).max() for t in maps]).amax().sqrt() > math.hypot(*size))
+
+    def clipped(self, values: Tensor, labels: Labels, size: int) -> tuple[Tensor, Labels]:
+        """Motions and discs that are no larger than the picture asks for.
+
+        A disc that moves evenly is a mean of discs over time. Those that do not reach the picture add nothing: what is
+        left is a shorter motion, with as much less light. A disc that covers all of the picture all the time has the
+        same density everywhere, the reciprocal of its area: a smaller one that stands still stands for it, with as much
+        less light.
+        """
+        coc, (motion, offset) = labels.required_coc(), _path(labels)
+        height, width = (n * size for n in values.shape[2:])
+        rows, columns = ((torch.arange(n, device=coc.device) + 0.5) * size - 0.5 for n in values.shape[2:])
+        radius, length = coc.abs(), _length(motion.detach())
+        diagonal = math.hypot(height, width) + size
+        wide = radius > diagonal + length / 2 + _length(offset.detach())
+        # Samples of the bank fade towards their ends, so these are to lie well beyond the picture.
+        room = radius + max(height, width) / 4 + 2 * size
+        first, last = torch.full_like(radius, -0.5), torch.full_like(radius, 0.5)
+        for axis, (place, extent) in enumerate(((columns, width), (rows[:, None], height))):
+            start, speed = place + offset[:, axis : axis + 1], motion[:, axis : axis + 1]
+            speed = torch.where(speed.abs() < TINY, TINY, speed)
+            ends = (-0.5 - room - start) / speed, (extent - 0.5 + room - start) / speed
+            first, last = first.maximum(torch.minimum(*ends)), last.minimum(torch.maximum(*ends))
+        share, middle = (last - first).clamp_min(0), (first + last) / 2
+        uncut = (length <= diagonal + 2 * room) & (share > 0)
+        share, middle = torch.where(uncut, 1.0, share), torch.where(uncut, 0.0, middle)
+        there = (share > 0) & ~wide
+        light = torch.where(wide, (diagonal / radius.clamp_min(1.0)).square(), share)
+        motion, offset = (torch.where(there, t, 0.0) for t in (share * motion, offset + middle * motion))
+        coc = torch.where(there, coc, torch.where(wide, diagonal, 0.0))
+        return values * light, labels._replace(coc=coc, motion=motion, offset=offset)
+
+
+def _path(labels: Labels) -> tuple[Tensor, Tensor]:
+    """Motion and offset of labels, ``(B, 2, H, W)``: 0 where they have none."""
+    still = torch.zeros_like(labels.required_coc()).expand(-1, 2, -1, -1)
+    return still if labels.motion is None else labels.motion, still if labels.offset is None else labels.offset
+
+
+def _length(way: Tensor) -> Tensor:
+    """``(B, 2, H, W) -> (B, 1, H, W)``."""
+    return way.square().sum(1, keepdim=True).sqrt()
 
 
 def of_radius(model: PsfModel, radius: Tensor, *lengths: Tensor, frame: Tensor | None = None) -> Place:

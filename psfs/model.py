@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -60,6 +60,16 @@ class Labels(NamedTuple):
     motion: Tensor | None = None
     offset: Tensor | None = None
     field: Tensor | None = None
+
+    def required_coc(self) -> Tensor:
+        """The CoC of labels that must have one.
+
+        Raises:
+            ValueError: they have none.
+        """
+        if self.coc is None:
+            raise ValueError("labels.coc: expected one, since pixels are merged by it, got none")
+        return self.coc
 
 
 def field_of(like: Tensor) -> Tensor:
@@ -157,6 +167,42 @@ class PsfModel(ABC):
         that only its shape is the nearest there is. None: samples are drawn as they are.
         """
         return None
+
+    def area(self, parts: Sequence[Labels], reach: Tensor) -> Tensor:
+        """About how many pixels ``(B, 1, H, W)`` the light of each is spread over, the mean of parts of an exposure.
+
+        ``reach (K,)`` is that of the samples in px, see `torchbokeh.psfs.bank.PsfBank.reach`.
+        """
+        found = [(place, self._reach(place, reach)) for part in parts for place in self.places(part)]
+        return torch.stack([(r * (1.0 if p.scale is None else p.scale)).square() for p, r in found]).mean(0)
+
+    def support(self, labels: Labels, reach: Tensor, pixels: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Discs that hold the PSFs of the ``pixels (B, 1, H, W)`` that are True; for ``reach`` see `area`.
+
+        Each is the offset ``(B, 2, H, W)`` of its centre from the pixel and its radius ``(B, 1, H, W)``, in px.
+        """
+        for place in self.places(labels):
+            radius = math.sqrt(2) * self._reach(place, reach) * (1.0 if place.scale is None else place.scale)
+            shift = 0.0 if place.offset is None else place.offset.square().sum(1, keepdim=True).sqrt()
+            yield torch.zeros_like(radius).expand(-1, 2, -1, -1), radius + shift + 1
+
+    def _reach(self, place: Place, reach: Tensor) -> Tensor:
+        return reach[self.grid.index(place.coordinates.movedim(1, -1))][:, None]
+
+    def splat_exactly(self, values: Tensor, labels: Labels, pixels: Tensor) -> Tensor | None:
+        """What a few bright pixels spread, ``(B, C, H, W)``, in closed form; None: their samples are drawn densely.
+
+        ``pixels (N,)`` are flat indices into ``(B, H, W)``.
+        """
+        return None
+
+    def needs_clipping(self, parts: Sequence[Labels], size: tuple[int, int]) -> bool:
+        """Whether PSFs are so much larger than a picture of ``(H, W)`` px that they are to be `clipped`."""
+        return False
+
+    def clipped(self, values: Tensor, labels: Labels, size: int) -> tuple[Tensor, Labels]:
+        """The same picture ``(B, C, h, w)``, in blocks of ``size`` px, by PSFs no larger than it asks for."""
+        return values, labels
 
     def settings(self) -> dict[str, float | int | str]:
         """What `torchbokeh.psfs.models.model_from` needs to build the model again; it stands in the file of a bank."""

@@ -122,6 +122,31 @@ def test_what_does_not_move_is_a_disc() -> None:
     assert SimpleLens().still(labels(3.0, 0.0, 0.0)) is None
 
 
+def test_the_area_is_that_of_the_mean_capsule() -> None:
+    both = [labels(3.0, 8.0, 0.0), labels(-5.0, 0.0, 4.0)]
+    assert Combined().area(both, torch.zeros(0)).item() == pytest.approx(4 * (4 * math.pi + 2 * 12) / 2)
+    still = Labels(coc=torch.zeros(1, 1, 1, 1))
+    assert Combined().area([still], torch.zeros(0)).item() == pytest.approx(math.pi / 4)
+
+
+def test_only_what_is_longer_than_the_diagonal_is_clipped() -> None:
+    model, size = Combined(), (3, 4)
+    for found in (labels(4.9, 0.0, 0.0), labels(0.0, 3.0, -3.9), labels(1.0, 4.9, 0.0)):
+        assert not model.needs_clipping([found], size)
+        assert model.needs_clipping([found, labels(-5.1, 0.0, 0.0)], size)
+    assert model.needs_clipping([labels(1.0, 0.0, 0.0)._replace(offset=torch.full((1, 2, 1, 1), 4.0))], size)
+    values = torch.ones(1, 1, 1, 1)
+    near, kept = model.clipped(values, labels(2.0, 1.0, 0.0), 1)
+    assert torch.equal(near, values)
+    assert all(torch.equal(a, b) for a, b in zip(kept[:3:2], labels(2.0, 1.0, 0.0)[:3:2], strict=True))
+    far, passing = model.clipped(values, labels(2.0, 1000.0, 0.0), 1)
+    assert float(passing.motion.norm()) == pytest.approx(1000 * float(far), rel=1e-5)
+    assert float(far) < 0.02
+    wide, disc = model.clipped(values, labels(1000.0, 5.0, 0.0), 1)
+    assert not disc.motion.any()
+    assert float(wide) == pytest.approx((float(disc.coc) / 1000) ** 2)
+
+
 def test_missing_maps_are_named() -> None:
     with pytest.raises(ValueError, match="combined: expected coc and motion, got no motion"):
         Combined().place(Labels(coc=torch.zeros(1, 1, 1, 1)))

@@ -43,6 +43,20 @@ def test_a_model_is_a_grid_of_boxes_with_few_words() -> None:
     assert torch.equal(smaller.coordinates, place.coordinates)
 
 
+def test_renderers_are_told_of_a_model_by_the_reach_of_its_samples() -> None:
+    model, labels = Boxes(), Labels(depth=torch.full((1, 1, 2, 2), 3.0))
+    reach = torch.tensor([2.0, 2.0, 2.0])
+    assert torch.equal(model.area([labels, labels], reach), torch.full((1, 1, 2, 2), 4.0))
+    ((shift, radius),) = model.support(labels, reach, torch.ones(1, 1, 2, 2, dtype=torch.bool))
+    assert shift.shape == (1, 2, 2, 2)
+    assert not shift.any()
+    assert bool((radius > math.hypot(2, 2)).all())  # the corners of a square
+    values = torch.rand(1, 2, 2, 2)
+    assert model.splat_exactly(values, labels, torch.tensor([0])) is None
+    assert not model.needs_clipping([labels], (2, 2))
+    assert model.clipped(values, labels, 1) == (values, labels)
+
+
 def test_prefiltering_is_a_weighted_mean() -> None:
     model = Boxes()
     blurred = model.prefiltered((2.0,), (5.0,))

@@ -1,14 +1,13 @@
 """Splatting from a bank of sparse PSFs: what each pixel needs of it, merged by radius, highlights apart (LKS 6)."""
 
-import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
 
-from torchbokeh.banks.highlights import dense_highlights, light_of, needed, support, tiers, usual
-from torchbokeh.banks.samples import located, splat_samples, spreading
+from torchbokeh.banks.highlights import brightness_classes, dense_highlights, ordinary_brightness, support
+from torchbokeh.banks.samples import BankSettings, Source, splat_samples, spreading
 from torchbokeh.ops.checks import check_image
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import SPREAD, Merging, highest_level, merged
@@ -16,8 +15,7 @@ from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
-from torchbokeh.psfs.combined import Combined
-from torchbokeh.psfs.model import Labels
+from torchbokeh.psfs.model import Labels, field_of
 
 
 @lru_cache(maxsize=4)
@@ -82,7 +80,7 @@ def packed(labels: Labels) -> Tensor:
         maps.append(labels.offset)
     if labels.field is not None:
         maps.append(labels.field)
-    return torch.cat(maps, 1) if maps else needed(labels)[:, :0]
+    return torch.cat(maps, 1) if maps else labels.required_coc()[:, :0]
 
 
 def unpacked(coc: Tensor, maps: Tensor, like: Labels) -> Labels:
@@ -134,131 +132,104 @@ def splat_bank(
     Raises:
         ValueError: the model needs another label.
     """
-    parts = [located(p, bank, values) for p in ([labels] if isinstance(labels, Labels) else labels)]
-    extreme = isinstance(bank.model, Combined) and _far_beyond(values, parts)
-    values = values if len(parts) == 1 else values / len(parts)
     if not values.numel():
         return torch.zeros_like(values)
-    lit = [_confined(values, part, 1) if extreme else (values, part) for part in parts]
-    ordinary = usual(torch.stack([one for one, _ in lit]).mean(0) if extreme else values)
-    dense, values = dense_highlights(values, lit, ordinary, bank, interpolate)
+    parts = [labels] if isinstance(labels, Labels) else list(labels)
+    if bank.model.fields:  # before any pixel is left out
+        parts = [p if p.field is not None else p._replace(field=field_of(values)) for p in parts]
+    settings = BankSettings(bank, interpolate, bank.model.needs_clipping(parts, (values.shape[2], values.shape[3])))
+    values = values if len(parts) == 1 else values / len(parts)
+    sources = [bank.model.clipped(values, part, 1) if settings.clip else (values, part) for part in parts]
+    mean = torch.stack([source for source, _ in sources]).mean(0) if settings.clip else values
+    out, values = dense_highlights(values, sources, ordinary_brightness(mean), settings)
 
-    count = bank.values.shape[1]
-    lowest, *brighter = tiers(values, count)
-    if not brighter:
-        return dense + _splat(values, parts, bank, merging, highest, interpolate, extreme)
-    lower = torch.cat([values[:, :-count] * lowest, values[:, -count:]], 1)
-    out = dense + _splat(lower, parts, bank, merging, highest, interpolate, extreme)
+    count, spread, level = bank.values.shape[1], partial(splat_parts, parts=parts, settings=settings), 0
+    darkest, *brighter = brightness_classes(values, count)
+    rest = torch.cat([values[:, :-count] * darkest, values[:, -count:]], 1) if brighter else values
+    if merging and highest:
+        coc, maps = _merging_maps(parts)
+        # Bins and layers are parts of a picture, and need not have its largest radii.
+        largest = float(torch.where(spreading(rest)[:, None], coc.detach().abs(), 0.0).max())
+        level = min(highest, highest_level(largest, (values.shape[2], values.shape[3]), merging))
+    out = out + (merged(rest, coc, spread, merging, level, labels=maps) if merging and level else spread(rest))
     for bright in brighter:
         # As where discs are merged, what is bright is not; beyond its support it is dark, and nowhere less than that.
-        source = light_of(values, count) * bright
-        apart = _splat(source, parts, bank, None, 0, interpolate, extreme)
+        source = torch.cat([values[:, :-count] * bright, torch.zeros_like(values[:, -count:])], 1)
+        apart = spread(source)
         apart = apart if bool((source < 0).any()) else apart.clamp_min(0)
-        out = out + apart * support(bright, [part for _, part in lit], bank)
+        out = out + apart * support(bright, [part for _, part in sources], bank)
     return out
 
 
-def _splat(
+def splat_parts(
     values: Tensor,
+    radius: Tensor | None = None,
+    means: Tensor | None = None,
+    size: int = 1,
+    *,
     parts: Sequence[Labels],
-    bank: PsfBank,
-    merging: Merging | None,
-    highest: int,
-    interpolate: bool,
-    extreme: bool,
+    settings: BankSettings,
 ) -> Tensor:
-    """`splat_bank` of values that are all spread alike; ``extreme`` says that `_confined` has something to do."""
-
-    def splat(cells: Tensor, now: Sequence[Labels], size: int) -> Tensor:
-        out = torch.zeros_like(cells)
-        moving: list[tuple[Tensor, Labels]] = []
-        discs: list[tuple[Tensor, Tensor]] = []
-        for part in now:
-            lit, part = _confined(cells, part, size) if extreme else (cells, part)
-            still = None if part.coc is None else bank.model.still(part)
-            if still is None or part.coc is None:
-                moving.append((lit, part))
-                continue
-            alive = spreading(lit)[:, None]
-            if bool((alive & (still < 1)).any()):
-                moving.append((lit * (1 - still), part))
-            if not bool((alive & (still > 0)).any()):
-                continue
-            if discs and discs[-1][0] is part.coc:
-                discs[-1] = part.coc, discs[-1][1] + lit * still
-            else:
-                discs.append((part.coc, lit * still))
-        for coc, lit in discs:
-            out = out + splat_spans(lit, coc / size, Disc().profile(), integrate=True)
-        return out + splat_samples(moving, bank, size, interpolate) if moving else out
-
-    if merging is None or highest == 0:
-        return splat(values, parts, 1)
-    varies = any(part.coc is not parts[0].coc for part in parts)
-    coc = torch.stack([needed(p).abs() for p in parts]).amin(0) if varies else needed(parts[0])
-    # Bins and layers are parts of a picture, and need not have its largest radii.
-    largest = float(torch.where(spreading(values)[:, None], coc.detach().abs(), 0.0).max())
-    highest = min(highest, highest_level(largest, (values.shape[2], values.shape[3]), merging))
-    if highest == 0:
-        return splat(values, parts, 1)
-    maps = [torch.cat([packed(p), needed(p).abs()], 1) if varies else packed(p) for p in parts]
-
-    def splat_cells(cells: Tensor, radius: Tensor, means: Tensor, size: int) -> Tensor:
-        now, shared = [], radius * size
-        for part, mean in zip(parts, means.split([m.shape[1] for m in maps], 1), strict=True):
-            if not varies:
-                now.append(unpacked(shared, mean, part))
-                continue
-            own = mean[:, -1:]
-            if size > 1:
-                own = (own.square() - SPREAD * size**2).clamp_min((MIN_RADIUS * size) ** 2).sqrt()
-            now.append(unpacked(own, mean[:, :-1], part))
-        return splat(cells, now, size)
-
-    return merged(values, coc, splat_cells, merging, highest, labels=torch.cat(maps, 1))
-
-
-def _far_beyond(values: Tensor, parts: Sequence[Labels]) -> bool:
-    """Whether a way or a disc is far larger than the picture, so that its buffer would be as large as it."""
-    sizes = [t.detach().square().sum(1) for p in parts for t in (p.motion, p.offset) if t is not None]
-    sizes += [p.coc.detach()[:, 0].square() for p in parts if p.coc is not None]
-    if not values.numel() or not sizes:
-        return False
-    return bool(torch.stack([t.max() for t in sizes]).amax().sqrt() > math.hypot(*values.shape[2:]))
-
-
-def _confined(values: Tensor, part: Labels, size: int) -> tuple[Tensor, Labels]:
-    """The same picture with ways and discs that are no larger than it asks for, for `Combined`.
-
-    A disc that moves evenly is a mean of discs over time. Those that do not reach the picture add nothing: what is left
-    is a shorter way, with as much less light. A disc that covers all of the picture all the time has the same density
-    everywhere, the reciprocal of its area: a smaller one that stands still stands for it, with as much less light.
+    """Splat a picture in each part of an exposure: what stands still as discs, all else by samples of the bank.
 
     Args:
-        values: ``(B, C, h, w)``, of blocks of ``size`` px.
-        part: its labels, in px.
+        values: ``(B, C, h, w)``, what each block of ``size`` px spreads in a part.
+        radius: ``(B, 1, h, w)``, mean of the CoC that blocks were merged by, in blocks; None: none were.
+        means: ``(B, E, h, w)``, of the other maps of `_merging_maps`; likewise.
         size: see ``values``.
+        parts: labels in px.
+        settings: the bank, whether to interpolate between its samples, and whether to clip them.
+
+    Returns:
+        ``(B, C, h, w)``.
     """
-    coc, height, width = needed(part), values.shape[2] * size, values.shape[3] * size
-    motion = torch.zeros_like(coc).expand(-1, 2, -1, -1) if part.motion is None else part.motion
-    offset = torch.zeros_like(motion) if part.offset is None else part.offset
-    rows, columns = ((torch.arange(n, device=coc.device) + 0.5) * size - 0.5 for n in values.shape[2:])
-    radius, length = coc.abs(), motion.detach().square().sum(1, keepdim=True).sqrt()
-    diagonal = math.hypot(height, width) + size
-    wide = radius > diagonal + length / 2 + offset.detach().square().sum(1, keepdim=True).sqrt()
-    # Samples of the bank fade towards their ends, so these are to lie well beyond the picture.
-    room = radius + max(height, width) / 4 + 2 * size
-    first, last = torch.full_like(radius, -0.5), torch.full_like(radius, 0.5)
-    for axis, (place, extent) in enumerate(((columns, width), (rows[:, None], height))):
-        start, speed = place + offset[:, axis : axis + 1], motion[:, axis : axis + 1]
-        speed = torch.where(speed.abs() < TINY, TINY, speed)
-        ends = (-0.5 - room - start) / speed, (extent - 0.5 + room - start) / speed
-        first, last = first.maximum(torch.minimum(*ends)), last.minimum(torch.maximum(*ends))
-    share, middle = (last - first).clamp_min(0), (first + last) / 2
-    uncut = (length <= diagonal + 2 * room) & (share > 0)
-    share, middle = torch.where(uncut, 1.0, share), torch.where(uncut, 0.0, middle)
-    there = (share > 0) & ~wide
-    light = torch.where(wide, (diagonal / radius.clamp_min(1.0)).square(), share)
-    motion, offset = (torch.where(there, t, 0.0) for t in (share * motion, offset + middle * motion))
-    coc = torch.where(there, coc, torch.where(wide, diagonal, 0.0))
-    return values * light, part._replace(coc=coc, motion=motion, offset=offset)
+    model = settings.bank.model
+    if radius is not None and means is not None:
+        parts = _of_blocks(radius, means, size, parts)
+    moving: list[Source] = []
+    discs: list[tuple[Tensor, Tensor]] = []
+    for part in parts:
+        light, part = model.clipped(values, part, size) if settings.clip else (values, part)
+        still = model.still(part)
+        if still is None:
+            moving.append((light, part))
+            continue
+        alive, coc = spreading(light)[:, None], part.required_coc()
+        if bool((alive & (still < 1)).any()):
+            moving.append((light * (1 - still), part))
+        if not bool((alive & (still > 0)).any()):
+            continue
+        if discs and discs[-1][0] is coc:
+            discs[-1] = coc, discs[-1][1] + light * still
+        else:
+            discs.append((coc, light * still))
+    out = torch.zeros_like(values)
+    for coc, light in discs:
+        out = out + splat_spans(light, coc / size, Disc().profile(), integrate=True)
+    return out + splat_samples(moving, settings, size) if moving else out
+
+
+def _merging_maps(parts: Sequence[Labels]) -> tuple[Tensor, Tensor]:
+    """The CoC that pixels are merged by, the smallest where it varies, and what is averaged, ``(B, E, H, W)``."""
+    coc, maps = parts[0].required_coc(), [packed(part) for part in parts]
+    if _coc_varies(parts):
+        radii = [part.required_coc().abs() for part in parts]
+        coc, maps = torch.stack(radii).amin(0), [torch.cat(pair, 1) for pair in zip(maps, radii, strict=True)]
+    return coc, torch.cat(maps, 1)
+
+
+def _of_blocks(radius: Tensor, means: Tensor, size: int, like: Sequence[Labels]) -> list[Labels]:
+    """The labels of blocks of ``size`` px, from averages of `_merging_maps`: of the same kinds as ``like``."""
+    found, varies, shared = [], _coc_varies(like), radius * size
+    for mean, part in zip(means.chunk(len(like), 1), like, strict=True):
+        coc = shared
+        if varies:
+            coc, mean = mean[:, -1:], mean[:, :-1]
+            if size > 1:
+                coc = (coc.square() - SPREAD * size**2).clamp_min((MIN_RADIUS * size) ** 2).sqrt()
+        found.append(unpacked(coc, mean, part))
+    return found
+
+
+def _coc_varies(parts: Sequence[Labels]) -> bool:
+    return any(part.coc is not parts[0].coc for part in parts)

@@ -7,10 +7,7 @@ What is renamed or moved inside the package is renamed here. ``torchbokeh.ops`` 
 from torchbokeh.banks import highlights as bank_highlights
 from torchbokeh.banks import samples as bank_samples
 from torchbokeh.banks import splat as bank_splatting
-from torchbokeh.banks.highlights import BRIGHT, share_of_others, usual
-from torchbokeh.banks.highlights import _area as area_of_labels
-from torchbokeh.banks.splat import _confined as confined
-from torchbokeh.banks.splat import _far_beyond as far_beyond
+from torchbokeh.banks.highlights import BRIGHT, ordinary_brightness, share_of_others
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
 from torchbokeh.compose.composition import CERTAIN
 from torchbokeh.compose.surfaces import COARSE

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchbokeh import PsfBank
-from torchbokeh.banks.highlights import CONTRAST, DARK, support, tiers
+from torchbokeh.banks.highlights import CONTRAST, DARK, brightness_classes, support
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
 from torchbokeh.ops.capsules import splat_capsules
 from torchbokeh.psfs.model import Labels
@@ -31,57 +31,59 @@ def everywhere(*way: float, size: tuple[int, int]) -> Tensor:
 
 @few
 @given(seed=st.integers(0, 999), decades=st.floats(0, 12), black=st.floats(0, 0.5))
-def test_tiers_make_up_the_picture(seed: int, decades: float, black: float) -> None:
+def test_brightness_classes_make_up_the_picture(seed: int, decades: float, black: float) -> None:
     draw = torch.Generator().manual_seed(seed)
     image = 10 ** (decades * torch.rand(1, 3, 17, 23, dtype=F64, generator=draw))
     image *= torch.rand(1, 1, 17, 23, generator=draw) >= black
-    found = tiers(with_coverage(image), 1)
+    found = brightness_classes(with_coverage(image), 1)
     assert (torch.stack(found).sum(0) == 1).all()
     assert len(found) <= 1 + math.ceil(decades / math.log10(CONTRAST))
     brightness = image.amax(1, keepdim=True)
-    for k, tier in enumerate(found):
+    for k, pixels in enumerate(found):
         left = brightness[torch.stack(found[k:]).any(0) & (brightness > 0)].sort().values
         if len(left):
             dark = left[int(DARK * len(left))]
-            assert (brightness[tier] <= CONTRAST * dark).all()
+            assert (brightness[pixels] <= CONTRAST * dark).all()
 
 
 def test_what_has_no_dark_parts_is_spread_at_once() -> None:
     for image in (torch.rand(2, 3, 9, 9) + 0.05, torch.zeros(1, 3, 9, 9), torch.full((1, 3, 1, 1), 1e9)):
-        assert len(tiers(with_coverage(image), 1)) == 1
-    assert len(tiers(torch.ones(1, 1, 5, 5), 1)) == 1  # coverage alone
+        assert len(brightness_classes(with_coverage(image), 1)) == 1
+    assert len(brightness_classes(torch.ones(1, 1, 5, 5), 1)) == 1  # coverage alone
     for covered in (0.0, 1e-15):
-        assert len(tiers(torch.cat([torch.ones(1, 3, 5, 5), torch.full((1, 1, 5, 5), covered)], 1), 1)) == 1
+        assert (
+            len(brightness_classes(torch.cat([torch.ones(1, 3, 5, 5), torch.full((1, 1, 5, 5), covered)], 1), 1)) == 1
+        )
 
 
 @pytest.mark.parametrize("odd", [math.nan, math.inf, 1e-45, -1e9])
-def test_odd_values_end_in_some_tier(odd: float) -> None:
+def test_odd_values_end_in_some_class(odd: float) -> None:
     image = torch.ones(1, 3, 9, 9)
     image[..., 4, 4] = odd
-    found = tiers(with_coverage(image), 1)
+    found = brightness_classes(with_coverage(image), 1)
     assert (torch.stack(found).sum(0) == 1).all()
     assert len(found) <= 2
 
 
-def test_tiers_of_a_batch_are_those_of_its_pictures() -> None:
+def test_brightness_classes_of_a_batch_are_those_of_its_pictures() -> None:
     image = torch.ones(3, 3, 20, 20)
     image[1, :, :9] = 1e3
     image[2, :, 3:5], image[2, :, 7:] = 1e3, 1e6
-    found = tiers(with_coverage(image), 1)
+    found = brightness_classes(with_coverage(image), 1)
     assert len(found) == 3
     for n in range(3):
-        alone = tiers(with_coverage(image[n : n + 1]), 1)
+        alone = brightness_classes(with_coverage(image[n : n + 1]), 1)
         assert len(alone) == n + 1
-        for k, tier in enumerate(found):
-            assert torch.equal(tier[n : n + 1], alone[k] if k < len(alone) else torch.zeros_like(tier[:1]))
+        for k, pixels in enumerate(found):
+            assert torch.equal(pixels[n : n + 1], alone[k] if k < len(alone) else torch.zeros_like(pixels[:1]))
 
 
 def test_half_the_light_in_half_the_parts_is_as_bright() -> None:
     image = torch.ones(1, 3, 20, 20)
     image[..., :3] = 90.0
-    assert len(tiers(with_coverage(image) / 8, 1)) == 1
+    assert len(brightness_classes(with_coverage(image) / 8, 1)) == 1
     image[..., :3] = 110.0
-    assert len(tiers(with_coverage(image) / 8, 1)) == 2
+    assert len(brightness_classes(with_coverage(image) / 8, 1)) == 2
 
 
 @few

@@ -12,7 +12,7 @@ from torchbokeh.banks.splat import packed, splat_bank, unpacked
 from torchbokeh.ops.capsules import _density
 from torchbokeh.ops.merge import Merging
 from torchbokeh.ops.splat import splat_spans
-from torchbokeh.psfs import Combined, Disc, Labels, PsfBank, SimpleLens
+from torchbokeh.psfs import Combined, Disc, Labels, PsfBank
 from torchbokeh.psfs.combined import capsule
 from torchbokeh.psfs.represent import Represented, Target, laplacian, nonzero
 
@@ -243,22 +243,6 @@ def test_the_module_is_its_function(bank: PsfBank) -> None:
     torch.testing.assert_close(merged(image, 4 * labels.coc, motion=labels.motion), out[:, :3] / out[:, 3:])
 
 
-def test_coloured_psfs_spread_each_channel_by_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    psfs = np.concatenate([capsule(2.0, 0.0), 0.5 * capsule(2.0, 0.0), 0.25 * capsule(2.0, 0.0)])
-    model = SimpleLens()
-    sample = Represented("direct", nonzero(psfs))
-    bank = PsfBank(model, [sample] * len(model.grid))
-    image, coc = torch.rand(1, 6, 15, 16), torch.full((1, 1, 15, 16), 2.0)
-    plain = KernelSplatting(bank=bank, quality="exact")(image, coc)
-    torch.testing.assert_close(plain, KernelSplatting(quality="exact")(image, coc), rtol=1e-2, atol=8e-3)
-    monkeypatch.setattr(SimpleLens, "tints", True)
-    tinted = KernelSplatting(bank=bank, quality="exact")(image, coc)
-    gain = torch.tensor([1.0, 0.5, 0.25]).repeat(2)[:, None, None]
-    torch.testing.assert_close(tinted, plain * gain)
-    with pytest.raises(ValueError, match="image: expected a multiple of 3 channels for coloured PSFs, got 4"):
-        KernelSplatting(bank=bank)(image[:, :4], coc)
-
-
 def test_what_is_refused(bank: PsfBank) -> None:
     image, coc = torch.rand(1, 3, 8, 8), torch.zeros(1, 1, 8, 8)
     with pytest.raises(TypeError, match="bank: expected a PsfBank or None, got str"):
@@ -281,14 +265,6 @@ def test_what_is_refused(bank: PsfBank) -> None:
         KernelSplatting(bank=bank)(image, coc, depth=coc)
     with pytest.raises(ValueError, match="depth: expected either depth or coc, got neither"):
         KernelSplatting()(image)
-
-
-def test_pixels_without_light_and_empty_pictures_cost_nothing(bank: PsfBank, monkeypatch: pytest.MonkeyPatch) -> None:
-    labels = scene(12, 14, 30.0, 60.0, 0.0)
-    monkeypatch.setattr("torchbokeh.banks.samples.splat_points", None)
-    assert float(splat_bank(torch.zeros(1, 4, 12, 14), labels, bank).abs().max()) == 0
-    empty = KernelSplatting(bank=bank)(torch.zeros(0, 3, 4, 5), torch.zeros(0, 1, 4, 5), motion=torch.zeros(0, 2, 4, 5))
-    assert empty.shape == (0, 3, 4, 5)
 
 
 def test_targets_are_what_a_bank_says_of_itself(bank: PsfBank) -> None:
@@ -317,33 +293,12 @@ def test_highlights_of_coloured_psfs_do_not_leak() -> None:
     torch.testing.assert_close(added.sum((1, 2)), torch.full((3,), 1e6), rtol=0.01, atol=0)
 
 
-def test_half_precision_overflows_as_in_torch() -> None:
-    # A yellow and magenta star: more red light than there was, and less green.
-    blur = KernelSplatting(bank=PsfBank.load("stylized"), quality="exact")
-    image, coc = torch.full((1, 3, 9, 8), 65504.0), torch.full((1, 1, 9, 8), 4.0)
-    out = blur(image.half(), coc.half())
-    assert (out[:, 0] == torch.inf).all()
-    assert out[:, 1:].isfinite().all()
-    torch.testing.assert_close(out, blur(image.double(), coc.double()).half())
-    assert blur(image.bfloat16(), coc.bfloat16()).isfinite().all()
-
-
 def test_a_cluster_of_highlights_does_not_hide_itself(bank: PsfBank) -> None:
     image, labels = torch.ones(1, 2, 96, 96), scene(96, 96, 19.0, 8.0, 8.0)
     lit = image.clone()
     lit[0, 0, 22:27, 30:35] = 3e5
     added = (splat_bank(lit, labels, bank) - splat_bank(image, labels, bank))[0, 0]
     assert float(added[60:].abs().max()) < 1e-3
-
-
-def test_psfs_that_depend_on_the_place_do_not_depend_on_what_is_dark() -> None:
-    # A dark picture is a list of pixels, each of which must keep its place.
-    bank, coc = PsfBank.load("physical-lens"), torch.full((1, 1, 48, 64), 5.0)
-    dot, haze = torch.zeros(1, 3, 48, 64), torch.full((1, 3, 48, 64), 1.0)
-    dot[..., 10, 50] = 1.0
-    covered = [torch.cat([t, t], 1) for t in (dot, haze, dot + haze)]
-    alone, without, within = (splat_bank(t, Labels(coc=coc), bank) for t in covered)
-    torch.testing.assert_close(alone, within - without, atol=1e-5, rtol=0)
 
 
 def test_a_disc_far_wider_than_the_picture_covers_it_evenly(bank: PsfBank) -> None:
@@ -415,19 +370,3 @@ def test_wide_discs_on_long_ways_cover_the_picture_evenly(bank: PsfBank) -> None
         out = splat_bank(values, ways, bank, merging, highest=0 if merging is None else 1)
         light = sum(0.5 / (math.pi * r**2) for r in (1e4, 3000.0)) * values.sum((2, 3), keepdim=True)
         torch.testing.assert_close(out, light.expand_as(out), rtol=1e-2, atol=0)
-
-
-@pytest.mark.parametrize(("name", "radius", "error"), [("simple-lens", 250.0, 1e-3), ("physical-lens", 120.0, 0.1)])
-def test_psfs_beyond_what_a_bank_samples_are_scaled(name: str, radius: float, error: float) -> None:
-    wide, labels = PsfBank.load(name), Labels(coc=torch.full((1, 1, 16, 13), radius))
-    assert radius > 2 * wide.model.axes[0].bound
-    values = torch.ones(1, 2 * wide.values.shape[1], 16, 13)
-    near = splat_bank(values, labels._replace(coc=labels.coc / 2), wide)[..., 6:10, 5:9]
-    # Around the middle of the picture, what arrives is the density in the middle of PSFs of twice the size.
-    torch.testing.assert_close(4 * splat_bank(values, labels, wide)[..., 6:10, 5:9], near, rtol=error, atol=0)
-
-
-def test_psfs_that_need_too_large_a_buffer_are_refused() -> None:
-    blur = KernelSplatting(bank=PsfBank.load("physical-lens"), quality="exact")
-    with pytest.raises(ValueError, match=r"coc: expected PSFs .* got PSFs that reach 2\d{4} px beyond 12 x 9 pixels"):
-        blur(torch.rand(1, 3, 9, 12), torch.full((1, 1, 9, 12), 1e4))

@@ -15,7 +15,7 @@ from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import laplacian, poisson_fft
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.combined import capsule
+from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import drawn
 from torchbokeh.report.internals import WIDEST, bank_highlights, bank_samples, bank_splatting
 from torchbokeh.report.rows import Row
@@ -174,6 +174,6 @@ def _confined(side: int) -> Row:
 
     with mock.patch.object(bank_samples, "poisson_fft", integrated):
         for extreme in (False, True):
-            with mock.patch.object(bank_splatting, "_far_beyond", lambda *_, found=extreme: found):
+            with mock.patch.object(Combined, "needs_clipping", lambda *_, found=extreme: found):
                 KernelSplatting(quality="exact", bank=bank_of("combined"))(image, coc, motion=way)
     return _row("ways no longer than the picture asks for", f"Mpx of a buffer, {small} x {small} px", *sizes)

@@ -21,7 +21,7 @@ from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels, Place
 from torchbokeh.psfs.represent import DOMAINS
-from torchbokeh.report.internals import BRIGHT, area_of_labels, confined, far_beyond, share_of_others, usual
+from torchbokeh.report.internals import BRIGHT, ordinary_brightness, share_of_others
 
 FINE = 2
 """Samples along each side of a pixel that the capsule of a highlight is drawn by (`torchbokeh.ops.capsules`)."""
@@ -41,14 +41,14 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
     Returns:
         ``(B, C, H, W)``, float64.
     """
-    extreme = isinstance(bank.model, Combined) and far_beyond(values, parts)
+    extreme = bank.model.needs_clipping(parts, (values.shape[2], values.shape[3]))
     if not bool((values != 0).any()):
         return values
     values = values / len(parts)
-    seen = [confined(values, part, 1) if extreme else (values, part) for part in parts]
+    seen = [bank.model.clipped(values, part, 1) if extreme else (values, part) for part in parts]
     light = torch.stack([t for t, _ in seen]).mean(0)
-    ordinary = usual(light)
-    bound = ordinary * (BRIGHT * area_of_labels([part for _, part in seen], bank)).clamp_min(LEAST_CONTRAST)
+    ordinary = ordinary_brightness(light)
+    bound = ordinary * (BRIGHT * bank.model.area([part for _, part in seen], bank.reach())).clamp_min(LEAST_CONTRAST)
     bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
     kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
     out = torch.zeros_like(values)
