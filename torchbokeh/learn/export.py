@@ -20,7 +20,7 @@ from torchbokeh.ops.system.files import replacing
 from torchbokeh.plan.plan import Plan, SplattingPlan
 from torchbokeh.renderers.kernel_splatting import KernelSplatting
 from torchbokeh.renderers.lens_blur import LensBlur
-from torchbokeh.renderers.planned import AnyPlan, Planned, fitting
+from torchbokeh.renderers.planned import AnyPlan, Planned
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -134,12 +134,14 @@ def _renderer(module: LensBlur | KernelSplatting, inputs: tuple[Tensor, ...], pl
     name = "coc" if lens is None else "depth"
     request = module.request(inputs[0], **{name: inputs[1]})
     found: AnyPlan = module.decide(request)
-    if plan is not None:
-        found = fitting(plan, type(found), request)
+    if plan is not None and not isinstance(plan, type(found)):
+        raise TypeError(f"plan: expected a {type(found).__name__} or None, got {type(plan).__name__}")
+    found = found if plan is None else plan
     if found.sharp or found.uniform is not None:
         raise ValueError("plan: expected one of a scene whose blur varies, got one that leaves the splatting out")
     if isinstance(found, Plan) and (found.colours or found.moves):
         raise ValueError("plan: expected one without dispersion and motion, which are not exported, got one with them")
+    found.check(request)
     names = next((given for kind, given in INPUTS.items() if isinstance(lens, kind)), ())
     values = (getattr(lens, parameter).detach() for parameter in names)
     call = _Call(Planned(module, found), names, name)

@@ -133,7 +133,8 @@ class KernelSplatting(nn.Module):
         """
         request = self.request(image, coc, depth=depth, motion=motion)
         plan = self.decide(request) if plan is None else fitting(plan, SplattingPlan, request)
-        return request.answered(self.paint(request, plan), *self.aperture.profile())
+        pieces = self.pieces(plan)
+        return request.answered(self.paint(request, plan, pieces), *pieces[1][0])
 
     def request(
         self,
@@ -176,15 +177,15 @@ class KernelSplatting(nn.Module):
         """The whole aperture."""
         return {1: [self.aperture.profile()]}
 
-    def paint(self, request: Request, plan: SplattingPlan, pieces: Pieces | None = None) -> Tensor:
+    def paint(self, request: Request, plan: SplattingPlan, pieces: Pieces) -> Tensor:
         """The picture ``(B, C, H, W)`` of a request, in at least float32.
 
         Args:
             request: as `request` found it good.
             plan: what to do.
-            pieces: those of `pieces`, where they are known.
+            pieces: those of `pieces`.
         """
-        ((profile,),) = (self.pieces(plan) if pieces is None else pieces).values()
+        ((profile,),) = pieces.values()
         if plan.sharp:
             return request.image.clone()
         with torch.autocast(request.image.device.type, enabled=False):

@@ -177,7 +177,8 @@ class LensBlur(nn.Module):
         if image.numel() == 0:
             return request.answered(image if image.dim() == 4 else image.sum(1))
         plan = self.decide(request) if plan is None else fitting(plan, Plan, request)
-        return request.answered(self.paint(request, plan), *self.aperture.profile())
+        pieces = self.pieces(plan)
+        return request.answered(self.paint(request, plan, pieces), *pieces[1][0])
 
     def request(
         self,
@@ -214,15 +215,14 @@ class LensBlur(nn.Module):
         profile = self.aperture.profile()
         return {count: subdivide(profile, count) for count in {1, *plan.cuts}}
 
-    def paint(self, request: Request, plan: Plan, pieces: Pieces | None = None) -> Tensor:
+    def paint(self, request: Request, plan: Plan, pieces: Pieces) -> Tensor:
         """The picture ``(B, C, H, W)`` of a request, with its margin, in at least float32.
 
         Args:
             request: as `request` found it good.
             plan: what to do.
-            pieces: those of `pieces`, where they are known.
+            pieces: those of `pieces`.
         """
-        pieces = self.pieces(plan) if pieces is None else pieces
         mixture, colour = Mixture(), None
         with torch.autocast(request.image.device.type, enabled=False):
             whole = one = request.working()

@@ -28,7 +28,7 @@ class PlannedRenderer(Protocol):
         """The shapes of the aperture that a plan splats with."""
         ...
 
-    def paint(self, request: Request, plan: Any, pieces: Pieces | None = None) -> Tensor:
+    def paint(self, request: Request, plan: Any, pieces: Pieces) -> Tensor:
         """The picture of a request, with its margin, in at least float32."""
         ...
 
