@@ -34,8 +34,8 @@ class Squircle(tb.Aperture):
             self.power = power
         else:
             self.register_buffer("power", torch.tensor(float(power)))
-        if not float(self.power) >= 1:
-            raise ValueError(f"power: expected at least 1, got {float(self.power)}")
+        if not self.power.item() >= 1:
+            raise ValueError(f"power: expected at least 1, got {self.power.item()}")
 
     def profile(self) -> Profile:
         """A polygon of `CORNERS` corners, differentiable to the power."""
