@@ -98,7 +98,7 @@ def renderings(lens: Any = None, aperture: Any = "disc") -> dict[str, Tensor]:
     found["planned"] = blur.planned(blur.plan(image, **given))(image, **given)
     if lens is None:
         found |= {q: tb.KernelSplatting(aperture, q)(image, **given) for q in QUALITIES}
-        world, camera = tb.scenes.coins(seed=0, size=SIZE, blur=5.0)
+        world, camera = tb.scenes.ramp(seed=0, size=SIZE, blur=5.0)
         found["scene"] = tb.AccumulationBuffer(aperture=aperture, views=16)(world, camera)
     return found
 
@@ -125,7 +125,7 @@ def test_an_aperture_of_ones_own_goes_through_every_renderer() -> None:
         other = float((square[name] - disc[name]).abs().mean() / disc[name].abs().mean())
         of_views = "Accumulation" in name or name == "scene"
         assert off < (0.05 if of_views else 0.01), name
-        assert other > (0.02 if of_views else 2 * off), name
+        assert other > (0.01 if of_views else 2 * off), name
 
 
 def test_both_are_learned() -> None:
