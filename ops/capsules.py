@@ -57,9 +57,9 @@ class _Capsules(torch.autograd.Function):
     @staticmethod
     def forward(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
         if has_kernel(values):
-            from torchbokeh.ops.kernels import capsules as _capsule_kernels
+            from torchbokeh.ops.kernels import capsules as kernels
 
-            return _capsule_kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
+            return kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
         return _splat_capsules_torch(values, pixels, radius, motion, centre)
 
     @staticmethod

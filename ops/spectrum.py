@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchbokeh.ops import cie_1931 as _cie_1931
+from torchbokeh.ops import cie_1931
 from torchbokeh.ops.checks import check_flag, check_image
 from torchbokeh.ops.spans import working_dtype
 
@@ -207,11 +207,11 @@ def _dtype_for(values: Tensor) -> torch.dtype:
 
 
 def _matching(wavelength: Tensor) -> Tensor:
-    table = wavelength.new_tensor(_cie_1931.MATCHING)
-    place = (wavelength - _cie_1931.FIRST) / _cie_1931.STEP
+    table = wavelength.new_tensor(cie_1931.MATCHING)
+    place = (wavelength - cie_1931.FIRST) / cie_1931.STEP
     row = place.detach().long().clamp(0, len(table) - 2)
     values = torch.lerp(table[row], table[row + 1], (place - row)[..., None])
-    outside = (wavelength < _cie_1931.FIRST) | (wavelength > _cie_1931.LAST)
+    outside = (wavelength < cie_1931.FIRST) | (wavelength > cie_1931.LAST)
     return values.masked_fill(outside[..., None], 0)
 
 
@@ -243,7 +243,7 @@ def _ramp(wavelength: Tensor, knots: tuple[tuple[float, float], ...]) -> Tensor:
 @cache
 def _means(formula: Formula) -> tuple[float, ...]:
     """Mean of each channel from `LOW` to `HIGH`, before the scale."""
-    knots = torch.linspace(LOW, HIGH, len(_cie_1931.MATCHING), dtype=torch.float64, device="cpu")
+    knots = torch.linspace(LOW, HIGH, len(cie_1931.MATCHING), dtype=torch.float64, device="cpu")
     value = _unclipped(knots, formula)
     if formula == "cie":
         # Linear between the knots, with the negative part cut off: of ends a > 0 > b only a triangle stays.

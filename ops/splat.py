@@ -154,9 +154,9 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
 def _splat_spans_op(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
     profile = Profile(knots, bulge)
     if has_kernel(values):
-        from torchbokeh.ops.kernels import splat as _span_kernels
+        from torchbokeh.ops.kernels import splat as kernels
 
-        return _span_kernels.splat_spans(values, coc, profile, integrate)
+        return kernels.splat_spans(values, coc, profile, integrate)
     return _splat_spans_torch(values, coc, profile, integrate)
 
 
@@ -171,9 +171,9 @@ def _gather_spans_op(
 ) -> list[Tensor]:
     profile = Profile(knots, bulge)
     if has_kernel(values) and not shape:
-        from torchbokeh.ops.kernels import splat as _span_kernels
+        from torchbokeh.ops.kernels import splat as kernels
 
-        grads = _span_kernels.gather_spans(grad, values, coc, profile)
+        grads = kernels.gather_spans(grad, values, coc, profile)
         return [*grads, torch.zeros_like(knots), torch.zeros_like(bulge)]
     return _gather_spans_torch(grad, values, coc, profile)
 
