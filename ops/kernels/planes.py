@@ -6,6 +6,8 @@ are independent and do not depend on the number of threads.
 """
 
 import math
+from functools import partial
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -20,6 +22,44 @@ MEMORY = 1 << 26
 
 BAND = 16
 """Rows of a band: small enough that bands keep all threads busy, large enough that a view's tables are reused."""
+
+
+class Textures(NamedTuple):
+    """The textures of K rectangles, see `Plates`.
+
+    Attributes:
+        texels: all levels of all textures, flat, with a rim of one texel.
+        first: ``(K, L)`` where the texels of each level begin.
+        sizes: ``(K, L, 2)`` width and height of each level, without the rim.
+        full: ``(K, 2)`` those of level 0.
+        mirror: ``(K,)`` whether the texture goes on without end.
+        infinite: ``(K,)`` whether the rectangle lies beyond everything.
+    """
+
+    texels: np.ndarray
+    first: np.ndarray
+    sizes: np.ndarray
+    full: np.ndarray
+    mirror: np.ndarray
+    infinite: np.ndarray
+
+
+class Views(NamedTuple):
+    """V views of K rectangles, see `torchbokeh.ops.planes.render_planes`.
+
+    Attributes:
+        inverse: ``(V, K, 3, 3)``.
+        level: ``(V, K)``.
+        order: ``(V, K)`` the rectangles, roughly from the nearest to the farthest.
+        copy: ``(V, K)`` number of the copy that is kept of a rendering for other views, or -1.
+        columns: ``(N, 2)`` first column of each copy, and how many it has.
+    """
+
+    inverse: np.ndarray
+    level: np.ndarray
+    order: np.ndarray
+    copy: np.ndarray
+    columns: np.ndarray
 
 
 # Only functions of numbers are inlined: numba counts references to arrays at each inlined call, with atomic
@@ -62,10 +102,13 @@ def _sort(active, count, depths):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _render_band(  # type: ignore[no-untyped-def]
-    texels, first, sizes, full, mirror, infinite, inverse, level, order, copy, columns, y0, y1, each, out, nearest
-):
-    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``."""
+def _render_band(textures, shown, each, out, nearest, y0, y1):  # type: ignore[no-untyped-def]
+    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``.
+
+    One long function: to hand arrays on within its loops would take longer than the work itself, see above.
+    """
+    texels, first, sizes, full, mirror, infinite = textures
+    inverse, level, order, copy, columns = shown
     views, count = level.shape
     width = out.shape[2]
     begin = np.empty(count, np.int64)
@@ -233,11 +276,9 @@ def render_planes(
     copy, columns = _copies(plates, sizes, homographies, level, size, parents)
     out = torch.zeros(views if frames else 1, *size, 4, dtype=torch.float32 if frames else torch.float64)
     nearest = torch.zeros(views if frames else 0, *size)
-    tables = (texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite), homographies)
-
-    def work(y0: int, y1: int) -> None:
-        _render_band(*tables, level.numpy(), order, copy, columns, y0, y1, frames, out.numpy(), nearest.numpy())
-
+    textures = Textures(texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite))
+    shown = Views(homographies, level.numpy(), order, copy, columns)
+    work = partial(_render_band, textures, shown, frames, out.numpy(), nearest.numpy())
     run_all(work, [(y, min(y + BAND, size[0])) for y in range(0, size[0], BAND)])
     mean = out if frames else out / max(views, 1)
     return mean.permute(0, 3, 1, 2).float().contiguous(), nearest[:, None] if frames else nearest.new_zeros(0)

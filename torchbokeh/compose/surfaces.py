@@ -333,7 +333,7 @@ def foreground_over_rest(
     highest: int,
 ) -> Tensor:
     """`compose` of `split_foreground` in blocks for the whole lens, in few passes; CPU float32, without gradients."""
-    return _foreground_over_rest_op(image, coc, *centres, *profile, *merging, highest)
+    return _foreground_over_rest_op(image, coc, *centres, profile, merging, highest)
 
 
 @torch.library.custom_op("torchbokeh::foreground_over_rest", mutates_args=())
@@ -342,15 +342,13 @@ def _foreground_over_rest_op(
     coc: Tensor,
     ahead: Sequence[float],
     behind: Sequence[float],
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
+    profile: Sequence[Tensor],
+    merging: Sequence[float],
     highest: int,
 ) -> Tensor:
     from torchbokeh.ops.kernels import foreground as kernels
 
-    profile, merging = Profile(knots, bulge), Merging(cells, highlight)
+    shape, extent = Profile(*profile), Merging(*merging)
     out = torch.empty_like(image)
     for n in range(len(image)):
         scene = image[n].numpy(), coc[n, 0].numpy()
@@ -361,10 +359,10 @@ def _foreground_over_rest_op(
         hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
         rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
         picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
-        rest_picture, density = blur_surface(picture, None, radius, behind, profile, merging, highest)
+        rest_picture, density = blur_surface(picture, None, radius, behind, shape, extent, highest)
         alpha = torch.from_numpy(front)[None, None]
-        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], ahead, profile, merging, highest)
-        half = half_density(here, total_here, profile, merging, highest)
+        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], ahead, shape, extent, highest)
+        half = half_density(here, total_here, shape, extent, highest)
         planes = (t.contiguous().numpy() for t in (half[0, 0], rest_picture[0], density[0, 0]))
         kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
         out[n] = rest_picture[0]
