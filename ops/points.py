@@ -33,13 +33,7 @@ class PointTable(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Where the PSFs of the pixels of a picture go, see `splat_points`.
-
-    Attributes:
-        rotation: ``(B, 2, 2, H, W)`` or ``None``.
-        position: ``(B, 2, H, W)`` or ``None``.
-        pad: width in px of the border.
-    """
+    """Where the PSFs go: ``rotation``, ``position`` and ``pad`` of `splat_points`, as far as they are given."""
 
     rotation: Tensor | None
     position: Tensor | None
@@ -324,17 +318,8 @@ def _gather_points_op(
 
 
 @_gather_points_op.register_fake
-def _(
-    grad: Tensor,
-    values: Tensor,
-    index: Tensor,
-    table: Sequence[Tensor],
-    rotation: Tensor | None,
-    position: Tensor | None,
-    pad: int,
-    geometry: bool,
-) -> list[Tensor]:
-    offsets, weights, _ = table
+def _(grad: Tensor, values: Tensor, index: Tensor, table: Sequence[Tensor], *settings: Any) -> list[Tensor]:
+    (offsets, weights, _), (rotation, position, _, geometry) = table, settings
     wanted = (values, _packed(offsets, weights), rotation, position) if geometry else (values,)
     return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in wanted if t is not None]
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchbokeh.ops import cie_1931
 from torchbokeh.ops.checks import check_flag, check_image
+from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 380.0, 780.0
@@ -54,7 +55,7 @@ def xyz(wavelength: Tensor) -> Tensor:
         [0.0, 0.0, 0.0]
     """
     _check_wavelength(wavelength)
-    return _matching(_working(wavelength)).to(_dtype_for(wavelength))
+    return _matching(_working(wavelength)).to(compute_dtype(wavelength))
 
 
 def linear_rgb(wavelength: Tensor, formula: Formula = "cie") -> Tensor:
@@ -85,7 +86,7 @@ def linear_rgb(wavelength: Tensor, formula: Formula = "cie") -> Tensor:
         [1]
     """
     _check_wavelength(wavelength)
-    return _rgb(_working(wavelength), formula).to(_dtype_for(wavelength))
+    return _rgb(_working(wavelength), formula).to(compute_dtype(wavelength))
 
 
 def spectral_samples(
@@ -137,7 +138,7 @@ def spectral_samples(
     else:
         wavelength = LOW + (HIGH - LOW) * points
         rgb = _rgb(wavelength, formula) * _weights(weight, wavelength)[:, None]
-    dtype = _dtype_for(unit)
+    dtype = compute_dtype(unit)
     return wavelength.to(dtype), _shares(rgb).to(dtype)
 
 
@@ -186,7 +187,7 @@ def spectral_bands(edges: Tensor, weight: Weight = None, formula: Formula = "cie
     lit = power > torch.finfo(power.dtype).eps * integrals[-1, 3]  # what is less is rounding of the integrals
     middle = 0.5 * (cuts[:-1] + cuts[1:])
     centre = torch.where(lit, moment / torch.where(lit, power, 1), middle)
-    dtype = _dtype_for(edges)
+    dtype = compute_dtype(edges)
     return centre.clamp(cuts[:-1], cuts[1:]).to(dtype), _shares(rgb).to(dtype)
 
 
@@ -200,10 +201,6 @@ def _check_wavelength(wavelength: object) -> None:
 def _working(values: Tensor) -> Tensor:
     """In double, where the device has it."""
     return values.to(working_dtype(values.device))
-
-
-def _dtype_for(values: Tensor) -> torch.dtype:
-    return torch.promote_types(values.dtype, torch.float32)
 
 
 def _matching(wavelength: Tensor) -> Tensor:

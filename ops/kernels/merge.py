@@ -33,14 +33,7 @@ WIDEST = 32.0
 
 
 class Band(NamedTuple):
-    """A band of rows that is being drawn.
-
-    Attributes:
-        sums: flat ``(rows, columns, 4)`` and more, differences along x.
-        stride: numbers in a row.
-        y0: its first row.
-        y1: one past its last row.
-    """
+    """Rows ``y0 .. y1-1`` that are being drawn: ``sums`` of differences along x, flat, ``stride`` numbers to a row."""
 
     sums: np.ndarray
     stride: int
@@ -51,12 +44,8 @@ class Band(NamedTuple):
 class Row(NamedTuple):
     """What a row of ``W`` pixels holds on the lowest level.
 
-    Attributes:
-        levels: ``(W,)`` see `classify`.
-        shares: ``(W,)`` likewise; used up.
-        energy: ``(W,)`` scratch.
-        pixels: ``(4 W,)`` four lanes of each.
-        radii: ``(W,)`` in steps of the bank; -1 stands for a pixel that has nothing there.
+    Beside what `classify` fills in, and ``energy (W,)`` as scratch: the interleaved ``pixels (4 W,)``, and
+    ``radii (W,)`` in steps of the bank, -1 for a pixel that has nothing there.
     """
 
     levels: np.ndarray

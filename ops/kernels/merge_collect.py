@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import FADE, LEAST_CONTRAST, Merging
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
 """Rows of a piece of work: 64 rows of 1024 columns in double fill the second-level cache of common processors."""
@@ -19,12 +19,8 @@ RECORD = 8
 
 
 class Picture(NamedTuple):
-    """What is splatted, one picture of a batch, or the gradient of each.
-
-    Attributes:
-        values: ``(C, H, W)``.
-        coc: ``(H, W)`` signed radius in px.
-        weight: ``(H, W)``, factor of the values; of no rows where there is none.
+    """A picture of a batch, or the gradients of one: ``values (C, H, W)``; ``coc (H, W)``, the signed radius in px;
+    and ``weight (H, W)``, factor of the values, of no rows where there is none.
     """
 
     values: np.ndarray
@@ -41,12 +37,8 @@ class Picture(NamedTuple):
 
 
 class Lanes(NamedTuple):
-    """Which channels a pass of four takes.
-
-    Attributes:
-        first: number of the first.
-        channel: ``(4,)`` their numbers, -1 where there is none.
-        constant: ``(4,)`` what is taken in its place.
+    """Which channels a pass of four takes, from the ``first`` on: their numbers ``channel (4,)``, or -1 where there is
+    none and the ``constant (4,)`` is taken in its place.
     """
 
     first: int
@@ -62,13 +54,7 @@ class Lanes(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """What the level of a pixel depends on, beside its radius.
-
-    Attributes:
-        merging: see `Merging`.
-        highest: the coarsest level.
-        means: ``(C,)`` mean of each channel, against which highlights are bright.
-    """
+    """What the level of a pixel depends on: highlights are bright against the ``means (C,)`` of the channels."""
 
     merging: Merging
     highest: int
@@ -284,13 +270,11 @@ def collect(picture: Picture, lanes: Lanes, merging: Merging, highest: int) -> L
     marks, counts = np.empty((height, width), np.int64), np.empty(height, np.int64)
     levels = Levels(thresholds, sizes, cells, reach, np.empty(0, np.int64))
     work = partial(_collect, picture, lanes, levels, marks, counts)
-    tile = max(1 << highest, BAND // 2)  # no cell lies in two tiles
-    run_all(work, [(y, min(y + tile, height)) for y in range(0, height, tile)], "collect")
+    run_all(work, row_bands(height, max(1 << highest, BAND // 2)), "collect")  # no cell lies in two of them
     found = [marks[y, : counts[y]] for y in np.flatnonzero(counts)]
     return levels._replace(marks=np.concatenate([levels.marks, *found]))
 
 
 def bands(height: int) -> list[tuple[int, int]]:
     """Pieces of work that together make up ``height`` rows; low pictures come in eight or so, for all threads."""
-    rows = min(max(-(-height // 8), 16), BAND)
-    return [(y, min(y + rows, height)) for y in range(0, height, rows)]
+    return row_bands(height, min(max(-(-height // 8), 16), BAND))

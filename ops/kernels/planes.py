@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.planes import SOLID, Plates
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 MEMORY = 1 << 26
 """Bytes of copies that each thread keeps."""
@@ -25,15 +25,9 @@ BAND = 16
 
 
 class Textures(NamedTuple):
-    """The textures of K rectangles, see `Plates`.
-
-    Attributes:
-        texels: all levels of all textures, flat, with a rim of one texel.
-        first: ``(K, L)`` where the texels of each level begin.
-        sizes: ``(K, L, 2)`` width and height of each level, without the rim.
-        full: ``(K, 2)`` those of level 0.
-        mirror: ``(K,)`` whether the texture goes on without end.
-        infinite: ``(K,)`` whether the rectangle lies beyond everything.
+    """The textures of K rectangles: their ``texels``, flat, each level with a rim of one texel; the ``first (K, L)`` of
+    each level, and its ``sizes (K, L, 2)``, width and height; the ``full (K, 2)`` sizes of level 0; and the flags
+    ``(K,)`` of `Plates`.
     """
 
     texels: np.ndarray
@@ -45,14 +39,9 @@ class Textures(NamedTuple):
 
 
 class Views(NamedTuple):
-    """V views of K rectangles, see `torchbokeh.ops.planes.render_planes`.
-
-    Attributes:
-        inverse: ``(V, K, 3, 3)``.
-        level: ``(V, K)``.
-        order: ``(V, K)`` the rectangles, roughly from the nearest to the farthest.
-        copy: ``(V, K)`` number of the copy that is kept of a rendering for other views, or -1.
-        columns: ``(N, 2)`` first column of each copy, and how many it has.
+    """V views: ``inverse (V, K, 3, 3)`` and ``level (V, K)`` as in `torchbokeh.ops.planes.render_planes`, the
+    rectangles in ``order (V, K)`` of depth, roughly; and of the copies that views share the numbers ``copy (V, K)``,
+    -1 for none, and the ``columns (N, 2)``, the first and how many.
     """
 
     inverse: np.ndarray
@@ -279,7 +268,7 @@ def render_planes(
     textures = Textures(texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite))
     shown = Views(homographies, level.numpy(), order, copy, columns)
     work = partial(_render_band, textures, shown, frames, out.numpy(), nearest.numpy())
-    run_all(work, [(y, min(y + BAND, size[0])) for y in range(0, size[0], BAND)])
+    run_all(work, row_bands(size[0], BAND))
     mean = out if frames else out / max(views, 1)
     return mean.permute(0, 3, 1, 2).float().contiguous(), nearest[:, None] if frames else nearest.new_zeros(0)
 

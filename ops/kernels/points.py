@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.kernels.interleave import add_one, add_pair, interleave
+from torchbokeh.ops.kernels.interleave import add_one, add_pair, interleave, separate
 from torchbokeh.ops.points import Placement
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BANDS = 16
 MIN_ROWS = 8
@@ -24,15 +24,8 @@ MIN_ROWS = 8
 
 
 class Placed(NamedTuple):
-    """The PSFs of one picture, between pixels.
-
-    Attributes:
-        index: ``(H, W)`` which PSF each pixel takes.
-        counts: ``(K+1,)`` see `PointTable`.
-        points: ``(P, 3)`` dx, dy and weight.
-        rotation: ``(2, 2, H, W)``; of no rows where there is none.
-        position: ``(2, H, W)``; likewise.
-        pad: width of the border.
+    """The PSFs of one picture: ``index (H, W)`` and ``counts (K+1,)`` as in a `PointTable`, ``points (P, 3)``, that is
+    dx, dy and weight, and the `Placement`, whose maps ``(2, 2, H, W)`` and ``(2, H, W)`` are empty if not given.
     """
 
     index: np.ndarray
@@ -44,15 +37,7 @@ class Placed(NamedTuple):
 
 
 class PlacedWhole(NamedTuple):
-    """The PSFs of one picture whose targets are pixels of the buffer.
-
-    Attributes:
-        index: see `Placed`.
-        counts: likewise.
-        steps: ``(P,)`` how many numbers further on in the buffer each point lies.
-        weights: ``(P,)``.
-        pad: width of the border.
-    """
+    """`Placed` where all targets are pixels: each point lies ``steps (P,)`` numbers further on in the buffer."""
 
     index: np.ndarray
     counts: np.ndarray
@@ -72,6 +57,20 @@ def _frame(rotation, position, y, x):  # type: ignore[no-untyped-def]
     return u, v, 1.0, 0.0, 0.0, 1.0
 
 
+@nb.njit(inline="always")
+def _corners(frame, dx, dy, weight, rows, stride):  # type: ignore[no-untyped-def]
+    """Where in a buffer the first of four corners of a point lies, -1 for outside, and what each of them gets."""
+    u0, v0, xx, xy, yx, yy = frame
+    u = u0 + xx * dx + xy * dy
+    v = v0 + yx * dx + yy * dy
+    if not (0.0 <= u < stride - 1 and 0.0 <= v < rows - 1):
+        return -1, 0.0, 0.0, 0.0, 0.0
+    i, j = int(u), int(v)
+    f, g = u - i, v - j
+    upper, lower = weight * (1.0 - g), weight * g
+    return 4 * (j * stride + i), upper * (1.0 - f), upper * f, lower * (1.0 - f), lower * f
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _splat_between(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-def]
     """Splat source rows ``y0 .. y1-1`` into ``out (N+2, Wp+2, 4)``.
@@ -89,22 +88,13 @@ def _splat_between(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-
             if src[p] == 0.0 and src[p + 1] == 0.0 and src[p + 2] == 0.0 and src[p + 3] == 0.0:
                 continue
             u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
-            u0 += pad + 1
-            v0 += pad + 1 - first
+            frame = u0 + (pad + 1), v0 + (pad + 1 - first), xx, xy, yx, yy
             psf = index[y, x]
             for k in range(counts[psf], counts[psf + 1]):
-                dx, dy, w = points[k, 0], points[k, 1], points[k, 2]
-                u = u0 + xx * dx + xy * dy
-                v = v0 + yx * dx + yy * dy
-                if not (0.0 <= u < stride - 1 and 0.0 <= v < rows - 1):
-                    continue
-                i, j = int(u), int(v)
-                f, g = u - i, v - j
-                upper, lower = w * (1.0 - g), w * g
-                o = 4 * (j * stride + i)
-                add_pair(flat, o, src, p, upper * (1.0 - f), upper * f)
-                o += 4 * stride
-                add_pair(flat, o, src, p, lower * (1.0 - f), lower * f)
+                o, a, b, c, d = _corners(frame, points[k, 0], points[k, 1], points[k, 2], rows, stride)
+                if o >= 0:
+                    add_pair(flat, o, src, p, a, b)
+                    add_pair(flat, o + 4 * stride, src, p, c, d)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -135,21 +125,13 @@ def _gather_between(grad, placed, y0, y1, out):  # type: ignore[no-untyped-def]
     for y in range(y0, y1):
         for x in range(width):
             u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
-            u0 += pad + 1
-            v0 += pad + 1
+            frame = u0 + (pad + 1), v0 + (pad + 1), xx, xy, yx, yy
             psf = index[y, x]
             s0 = s1 = s2 = s3 = 0.0
             for k in range(counts[psf], counts[psf + 1]):
-                dx, dy, w = points[k, 0], points[k, 1], points[k, 2]
-                u = u0 + xx * dx + xy * dy
-                v = v0 + yx * dx + yy * dy
-                if not (0.0 <= u < stride - 1 and 0.0 <= v < rows - 1):
+                o, a, b, c, d = _corners(frame, points[k, 0], points[k, 1], points[k, 2], rows, stride)
+                if o < 0:
                     continue
-                i, j = int(u), int(v)
-                f, g = u - i, v - j
-                upper, lower = w * (1.0 - g), w * g
-                a, b, c, d = upper * (1.0 - f), upper * f, lower * (1.0 - f), lower * f
-                o = 4 * (j * stride + i)
                 q = o + 4 * stride
                 s0 += a * flat[o] + b * flat[o + 4] + c * flat[q] + d * flat[q + 4]
                 s1 += a * flat[o + 1] + b * flat[o + 5] + c * flat[q + 1] + d * flat[q + 5]
@@ -180,8 +162,7 @@ def _gather_whole(grad, placed, y0, y1, out):  # type: ignore[no-untyped-def]
 
 
 def _bands(height: int) -> list[tuple[int, int]]:
-    rows = max(MIN_ROWS, -(-height // BANDS))
-    return [(y, min(y + rows, height)) for y in range(0, height, rows)]
+    return row_bands(height, max(MIN_ROWS, -(-height // BANDS)))
 
 
 def _reaches(points: Tensor, counts: Tensor, turned: bool) -> Tensor:
@@ -275,4 +256,4 @@ def gather_points(grad: Tensor, index: Tensor, points: Tensor, counts: Tensor, p
         (buffer[k], pictures[k // groups], y0, y1, out[k].numpy()) for k in range(b * groups) for y0, y1 in _bands(h)
     ]
     run_all(kernel, pieces)
-    return out.permute(0, 3, 1, 2).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
+    return separate(out, c)

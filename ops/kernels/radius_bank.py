@@ -36,13 +36,7 @@ class RadiusBank(NamedTuple):
 
 
 class PsfBuffer(NamedTuple):
-    """Room for one PSF that is not in a bank.
-
-    Attributes:
-        shape: what it is drawn from.
-        table: ``(7, > n)`` scratch of `row_table` and `row_slopes`.
-        rows: ``n`` rows.
-    """
+    """Room for ``n`` rows of one PSF of that shape; ``table (7, > n)`` is what `row_table` and `row_slopes` fill."""
 
     shape: Shape
     table: np.ndarray

@@ -12,25 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.kernels.interleave import add_one, interleave
+from torchbokeh.ops.kernels.interleave import add_one, interleave, separate
 from torchbokeh.ops.nbuffers import NBuffers
 from torchbokeh.ops.raycast import window
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 16
 """Rows of a band: few enough that threads which meet long rays are not the last to finish."""
 
 
 class Frame(NamedTuple):
-    """A picture that is looked at from elsewhere.
-
-    Attributes:
-        colour: flat, four to a pixel.
-        missed: what rays see that hit nothing, likewise.
-        cocs: ``(1 or S, H*W)`` one field for all views, or one for each, cut at the limit of `_add_view`.
-        bounds: ``(2, H, W)`` least and greatest CoC that the rays of each pixel can meet.
-        far: CoC from which on rays that hit nothing are not blocked.
-        tolerance: greatest gap in px between neighbouring pixels of one surface.
+    """A picture that is looked at from elsewhere: ``colour``, and ``missed``, what rays see that hit nothing, both
+    flat, four to a pixel; ``cocs (1 or S, H*W)``, one field for all views or one for each, cut at the limit of
+    `_add_view`; the ``bounds (2, H, W)`` of the CoC that rays can meet; and settings of
+    `torchbokeh.ops.raycast.subsample_blur`.
     """
 
     colour: np.ndarray
@@ -42,13 +37,10 @@ class Frame(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Where the rays of each view are after j steps, for all j that the bounds of the image allow.
+    """Where the rays of views ``(S, 2)`` are after j steps, for all j that the bounds of the image allow.
 
-    Attributes:
-        views: ``(S, 2)`` lens points.
-        first: ``(S,)`` the first j.
-        steps: ``(S, K, 2)`` for each j the pixel, relative to the output pixel.
-        shares: ``(S, K)`` how far the ray is from it towards the next one.
+    From the ``first (S,)`` j on, ``steps (S, K, 2)`` leads to a pixel, relative to the output pixel, and the ray is the
+    ``shares (S, K)`` away from it, towards the next one.
     """
 
     views: np.ndarray
@@ -258,7 +250,7 @@ def subsample_blur(
         extent = ranges[0][n], ranges[1][n]
         _bounds_band(low[:, n], high[:, n], extent, reach, iterations, y0, y1, bounds[n])
 
-    bands = [(y, min(y + BAND, h)) for y in range(0, h, BAND)]
+    bands = row_bands(h, BAND)
     run_all(find_bounds, [(n, *band) for n in range(b) for band in bands])
 
     groups = -(-c // 4)
@@ -278,4 +270,4 @@ def subsample_blur(
         _blur_band(frame, rays, y0, y1, result[k])
 
     run_all(blur, [(k, *band) for k in range(b * groups) for band in bands])
-    return out.reshape(b, groups, h, w, 4).permute(0, 1, 4, 2, 3).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
+    return separate(out, c)

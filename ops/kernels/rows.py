@@ -4,6 +4,7 @@ The loops are vector code: numba alone leaves four lanes apart. Lanes are four i
 `torchbokeh.ops.kernels.interleave`: after a change here, remove the ``__pycache__`` beside it.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,12 +18,9 @@ _I64 = ir.IntType(64)
 
 
 class PsfRows(NamedTuple):
-    """Rows of PSFs, as two ends that each add to two columns.
-
-    Attributes:
-        columns: ``(R, 2)`` whole column of the left and of the right end.
-        weights: ``(R, 4)`` what the left end adds to its column and the next, then the right end.
-        slopes: ``(R, 4)`` derivatives of the weights by the radius; empty if they were not asked for.
+    """Rows of PSFs: ``columns (R, 2)``, the whole column of the left and of the right end; ``weights (R, 4)``, what the
+    left end adds to its column and the next, then the right end; and their ``slopes (R, 4)``, derivatives by the
+    radius, empty if they were not asked for.
     """
 
     columns: np.ndarray
@@ -62,6 +60,23 @@ def _times(builder: Any, k: Any, factor: int, plus: int = 0) -> Any:
     return builder.add(builder.mul(k, _I64(factor)), _I64(plus))
 
 
+def _points(builder: Any, o: Any, stride: Any, columns: Any, span: Any) -> Iterator[tuple[Any, int, Any]]:
+    """In a loop over the rows of a span, for each point: the number of its row, its own, and where it lies."""
+    start, stop = cgutils.unpack_tuple(builder, span)
+    with cgutils.for_range_slice(builder, start, stop, _I64(1), _I64) as (k, _):
+        row = builder.add(o, builder.mul(builder.sub(k, start), stride))
+        for end in range(2):
+            column = builder.load(builder.gep(columns, [_times(builder, k, 2, end)]))
+            at = builder.add(row, _times(builder, column, 4))
+            for side in range(2):
+                yield k, 2 * end + side, builder.add(at, _I64(4 * side))
+
+
+def _plus_product(builder: Any, total: Any, lanes: Any, table: Any, index: Any) -> Any:
+    product = builder.fmul(lanes, _splat(builder, builder.load(builder.gep(table, [index]))), flags=("contract",))
+    return builder.fadd(total, product, flags=("contract",))
+
+
 @intrinsic
 def draw_rows(typingctx, band, o, stride, src, p, rows, span):  # type: ignore[no-untyped-def]
     """Add the rows ``span[0] .. span[1]-1`` of `PsfRows`, the first of them to the row of ``band`` at ``o``.
@@ -71,21 +86,13 @@ def draw_rows(typingctx, band, o, stride, src, p, rows, span):  # type: ignore[n
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         band, o, stride, src, p, rows, span = args
-        start, stop = cgutils.unpack_tuple(builder, span)
         band_data, src_data = _data(context, builder, sig.args[0], band), _data(context, builder, sig.args[3], src)
         columns_data, weights_data, _ = _tables(context, builder, sig.args[5], rows)
         pixel = builder.fpext(_load(builder, src_data, p, _F4), _D4)
-        with cgutils.for_range_slice(builder, start, stop, _I64(1), _I64) as (k, _):
-            row = builder.add(o, builder.mul(builder.sub(k, start), stride))
-            for end in range(2):
-                column = builder.load(builder.gep(columns_data, [_times(builder, k, 2, end)]))
-                at = builder.add(row, _times(builder, column, 4))
-                for side in range(2):
-                    weight = builder.load(builder.gep(weights_data, [_times(builder, k, 4, 2 * end + side)]))
-                    here = builder.add(at, _I64(4 * side))
-                    product = builder.fmul(pixel, _splat(builder, weight), flags=("contract",))
-                    total = builder.fadd(_load(builder, band_data, here, _D4), product, flags=("contract",))
-                    _store(builder, total, band_data, here)
+        for k, point, here in _points(builder, o, stride, columns_data, span):
+            before = _load(builder, band_data, here, _D4)
+            index = _times(builder, k, 4, point)
+            _store(builder, _plus_product(builder, before, pixel, weights_data, index), band_data, here)
         return context.get_dummy_value()
 
     i64 = types.int64
@@ -98,22 +105,14 @@ def gather_rows(typingctx, sums, o, stride, rows, span, found):  # type: ignore[
 
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         sums, o, stride, rows, span, found = args
-        start, stop = cgutils.unpack_tuple(builder, span)
         sums_data, found_data = _data(context, builder, sig.args[0], sums), _data(context, builder, sig.args[5], found)
         columns_data, *tables = _tables(context, builder, sig.args[3], rows)
         zero = ir.Constant(_D4, [0.0] * 4)
         totals = [cgutils.alloca_once_value(builder, zero) for _ in tables]
-        with cgutils.for_range_slice(builder, start, stop, _I64(1), _I64) as (k, _):
-            row = builder.add(o, builder.mul(builder.sub(k, start), stride))
-            for end in range(2):
-                column = builder.load(builder.gep(columns_data, [_times(builder, k, 2, end)]))
-                at = builder.add(row, _times(builder, column, 4))
-                for side in range(2):
-                    lanes = _load(builder, sums_data, builder.add(at, _I64(4 * side)), _D4)
-                    for table, total in zip(tables, totals, strict=True):
-                        weight = builder.load(builder.gep(table, [_times(builder, k, 4, 2 * end + side)]))
-                        product = builder.fmul(lanes, _splat(builder, weight), flags=("contract",))
-                        builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+        for k, point, here in _points(builder, o, stride, columns_data, span):
+            lanes, index = _load(builder, sums_data, here, _D4), _times(builder, k, 4, point)
+            for table, total in zip(tables, totals, strict=True):
+                builder.store(_plus_product(builder, builder.load(total), lanes, table, index), total)
         for k, total in enumerate(totals):
             _store(builder, builder.load(total), found_data, _I64(4 * k))
         return context.get_dummy_value()

@@ -14,22 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.kernels.interleave import add_pair, interleave
+from torchbokeh.ops.kernels.interleave import add_pair, interleave, separate
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, area, knot_integrals
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
 """Rows of a band: 64 rows of 1024 interleaved double pixels fill the second-level cache of common processors."""
 
 
 class Shape(NamedTuple):
-    """The unit shape of a PSF, as the kernels take it.
+    """The unit shape of a `Profile`: ``inverse_area`` is 1 / area.
 
-    Attributes:
-        tables: ``(2, K, 7)``, of the upright and of the point-mirrored shape, for each knot: y, left, right, integral
-            of left, integral of right, slope of left and right.
-        bulge: see `Profile`.
-        inverse_area: 1 / area.
+    ``tables (2, K, 7)`` has for each knot of the upright and of the point-mirrored shape: y, left, right, integral of
+    left, integral of right, slope of left and right.
     """
 
     tables: np.ndarray
@@ -295,10 +292,6 @@ def shape_of(profile: Profile) -> Shape:
     return Shape(torch.stack(tables).numpy(), float(profile.bulge), float(inverse_area))
 
 
-def _bands(height: int) -> list[tuple[int, int]]:
-    return [(y, min(y + BAND, height)) for y in range(0, height, BAND)]
-
-
 def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
     """`torchbokeh.ops.splat.splat_spans` for CPU float32."""
     b, c, h, w = values.shape
@@ -316,7 +309,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) 
         flat = src[k].reshape(-1)
         _splat_band(flat, coc_np[n, 0], reach[n], shape, integrate, y0, y1, out_np[k])
 
-    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in row_bands(h, BAND)])
     return out.reshape(b, 4 * groups, h, w)[:, :c].contiguous()
 
 
@@ -339,6 +332,5 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
             *(grad_src_np[k].reshape(-1), grad_coc_np[k % groups, n, 0]),
         )
 
-    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
-    grad_values = grad_src.permute(0, 3, 1, 2).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
-    return grad_values, grad_coc.sum(0).to(coc.dtype)
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in row_bands(h, BAND)])
+    return separate(grad_src, c), grad_coc.sum(0).to(coc.dtype)

@@ -26,12 +26,8 @@ from torchbokeh.ops.system.threads import run_all
 
 
 class Filled(NamedTuple):
-    """A picture that bins fill front to back, as `torchbokeh.ops.composite.fill_until_full` does.
-
-    Attributes:
-        mixed: ``(C, H, W)`` sum of the colours, times the share that each counts for.
-        taken: ``(H, W)`` coverage that is used up.
-        total: ``(H, W)`` sum of all coverages.
+    """A picture that bins fill front to back: ``mixed (C, H, W)``, the sum of their colours as far as they count; the
+    coverage ``taken (H, W)`` that is used up; and the ``total (H, W)`` of all coverages.
     """
 
     mixed: np.ndarray
