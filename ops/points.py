@@ -135,20 +135,20 @@ def _check_contents(index: Tensor, points: Tensor, counts: Tensor) -> None:
         raise ValueError(f"index: expected 0 to {psfs - 1}, a PSF of the table, got {low} to {high}")
 
 
-def _flatten(t: Tensor) -> Tensor:
+def flatten(t: Tensor) -> Tensor:
     """``(B, ..., H, W) -> (..., B*H*W)``."""
     return t.movedim(0, -3).reshape(*t.shape[1:-2], -1)
 
 
-def _unflatten(t: Tensor, like: Tensor) -> Tensor:
-    """Undo `_flatten`, in the shape and dtype of ``like``."""
+def unflatten(t: Tensor, like: Tensor) -> Tensor:
+    """Undo `flatten`, in the shape and dtype of ``like``."""
     b, *inner, h, w = like.shape
     return t.reshape(*inner, b, h, w).movedim(-3, 0).to(like.dtype).contiguous()
 
 
 def _flattened(placement: Placement) -> Placement:
     """The placement of flat pixels."""
-    rotation, position = (None if t is None else _flatten(t) for t in placement[:2])
+    rotation, position = (None if t is None else flatten(t) for t in placement[:2])
     return Placement(rotation, position, placement.pad)
 
 
@@ -203,7 +203,7 @@ def _splat_points_torch(
     b, c = values.shape[:2]
     rows, columns = (n + 2 * (placement.pad + _MARGIN) for n in size)
     work = working_dtype(values.device)
-    flat, flat_placement = _flatten(values).to(work), _flattened(placement)
+    flat, flat_placement = flatten(values).to(work), _flattened(placement)
     out = torch.zeros(c, b * rows * columns, dtype=work, device=values.device)
     for pixels, numbers in _expand(index, counts, (flat != 0).any(0)):
         here = points.index_select(0, numbers)
@@ -232,8 +232,8 @@ def _gather_points_torch(
     size = [n - 2 * placement.pad for n in grad.shape[-2:]]
     stride = grad.shape[-1] + 2 * _MARGIN
     work = working_dtype(values.device)
-    g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
-    flat, flat_placement = _flatten(values).to(work), _flattened(placement)
+    g = flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
+    flat, flat_placement = flatten(values).to(work), _flattened(placement)
     turn, place, _ = flat_placement
     by_values, by_points = torch.zeros_like(flat), torch.zeros_like(points)
     by_turn, by_place = (None if t is None else torch.zeros_like(t) for t in (turn, place))
@@ -257,11 +257,11 @@ def _gather_points_torch(
             by_turn.index_add_(2, pixels, move[:, None] * offsets.T)
             move = (turn.index_select(2, pixels) * move[:, None]).sum(0)
         by_points.index_add_(0, numbers, torch.stack([*move, (value * mass).sum(0)], 1))
-    grads = [_unflatten(by_values, values)]
+    grads = [unflatten(by_values, values)]
     if geometry:
         grads.append(by_points)
         frame = ((by_turn, placement.rotation), (by_place, placement.position))
-        grads += [_unflatten(t, like) for t, like in frame if t is not None and like is not None]
+        grads += [unflatten(t, like) for t, like in frame if t is not None and like is not None]
     return grads
 
 

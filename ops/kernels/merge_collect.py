@@ -144,7 +144,8 @@ def _add(cells, p, lanes, w, r, signed):  # type: ignore[no-untyped-def]
 def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
     """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
 
-    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
+    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are. One long
+    function: sums are kept in registers as long as neighbours go to the same cell.
     """
     values, coc, weight = picture
     thresholds, sizes, cells, reach, _ = levels

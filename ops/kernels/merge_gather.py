@@ -158,7 +158,7 @@ def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: 
     """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells.
 
     ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the lowest level, and the cells of ``levels``
-    hold their own gradients.
+    hold their own gradients. One long function: numba counts references to arrays that are handed on for each pixel.
     """
     values, coc, weight = picture
     grad_values, grad_coc, grad_weight = grads

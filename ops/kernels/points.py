@@ -24,11 +24,12 @@ MIN_ROWS = 8
 
 
 class Placed(NamedTuple):
-    """The PSFs of one picture: ``index (H, W)`` and ``counts (K+1,)`` as in a `PointTable`, ``points (P, 3)``, that is
-    dx, dy and weight, and the `Placement`, whose maps ``(2, 2, H, W)`` and ``(2, H, W)`` are empty if not given.
+    """The PSFs of one picture: ``psfs (H, W)``, which one each pixel takes; ``counts (K+1,)`` as in a `PointTable`;
+    ``points (P, 3)``, that is dx, dy and weight; and the `Placement`, whose maps ``(2, 2, H, W)`` and ``(2, H, W)`` are
+    empty if not given.
     """
 
-    index: np.ndarray
+    psfs: np.ndarray
     counts: np.ndarray
     points: np.ndarray
     rotation: np.ndarray
@@ -39,7 +40,7 @@ class Placed(NamedTuple):
 class PlacedWhole(NamedTuple):
     """`Placed` where all targets are pixels: each point lies ``steps (P,)`` numbers further on in the buffer."""
 
-    index: np.ndarray
+    psfs: np.ndarray
     counts: np.ndarray
     steps: np.ndarray
     weights: np.ndarray
@@ -78,8 +79,8 @@ def _splat_between(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-
     Its inner rows are the rows ``first .. first+N-1`` of the padded buffer. The border of one catches the corners
     that stick out.
     """
-    index, counts, points, rotation, position, pad = placed
-    width = index.shape[1]
+    psfs, counts, points, rotation, position, pad = placed
+    width = psfs.shape[1]
     rows, stride = out.shape[0], out.shape[1]
     flat = out.reshape(-1)
     for y in range(y0, y1):
@@ -89,7 +90,7 @@ def _splat_between(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-
                 continue
             u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
             frame = u0 + (pad + 1), v0 + (pad + 1 - first), xx, xy, yx, yy
-            psf = index[y, x]
+            psf = psfs[y, x]
             for k in range(counts[psf], counts[psf + 1]):
                 o, a, b, c, d = _corners(frame, points[k, 0], points[k, 1], points[k, 2], rows, stride)
                 if o >= 0:
@@ -100,8 +101,8 @@ def _splat_between(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _splat_whole(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-def]
     """`_splat_between` for `PlacedWhole`."""
-    index, counts, steps, weights, pad = placed
-    width = index.shape[1]
+    psfs, counts, steps, weights, pad = placed
+    width = psfs.shape[1]
     stride = out.shape[1]
     flat = out.reshape(-1)
     for y in range(y0, y1):
@@ -110,7 +111,7 @@ def _splat_whole(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-de
             if src[p] == 0.0 and src[p + 1] == 0.0 and src[p + 2] == 0.0 and src[p + 3] == 0.0:
                 continue
             o = 4 * ((y + pad + 1 - first) * stride + x + pad + 1)
-            psf = index[y, x]
+            psf = psfs[y, x]
             for k in range(counts[psf], counts[psf + 1]):
                 add_one(flat, o + steps[k], src, p, weights[k])
 
@@ -118,15 +119,15 @@ def _splat_whole(src, placed, y0, y1, first, out):  # type: ignore[no-untyped-de
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_between(grad, placed, y0, y1, out):  # type: ignore[no-untyped-def]
     """Adjoint for the source rows ``y0 .. y1-1`` of ``out (H, W, 4)``; ``grad (Hp+2, Wp+2, 4)`` has a border of 0."""
-    index, counts, points, rotation, position, pad = placed
-    width = index.shape[1]
+    psfs, counts, points, rotation, position, pad = placed
+    width = psfs.shape[1]
     rows, stride = grad.shape[0], grad.shape[1]
     flat = grad.reshape(-1)
     for y in range(y0, y1):
         for x in range(width):
             u0, v0, xx, xy, yx, yy = _frame(rotation, position, y, x)
             frame = u0 + (pad + 1), v0 + (pad + 1), xx, xy, yx, yy
-            psf = index[y, x]
+            psf = psfs[y, x]
             s0 = s1 = s2 = s3 = 0.0
             for k in range(counts[psf], counts[psf + 1]):
                 o, a, b, c, d = _corners(frame, points[k, 0], points[k, 1], points[k, 2], rows, stride)
@@ -143,14 +144,14 @@ def _gather_between(grad, placed, y0, y1, out):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_whole(grad, placed, y0, y1, out):  # type: ignore[no-untyped-def]
     """`_gather_between` for `PlacedWhole`."""
-    index, counts, steps, weights, pad = placed
-    width = index.shape[1]
+    psfs, counts, steps, weights, pad = placed
+    width = psfs.shape[1]
     stride = grad.shape[1]
     flat = grad.reshape(-1)
     for y in range(y0, y1):
         for x in range(width):
             o = 4 * ((y + pad + 1) * stride + x + pad + 1)
-            psf = index[y, x]
+            psf = psfs[y, x]
             s0 = s1 = s2 = s3 = 0.0
             for k in range(counts[psf], counts[psf + 1]):
                 i, w = o + steps[k], weights[k]
@@ -230,9 +231,9 @@ def splat_points(
         n = k // groups
         pieces = []
         for y0, y1 in _bands(h):
-            near = (None if t is None else t[n, ..., y0:y1, :] for t in (rotation, position))
+            turn, place = (None if t is None else t[n, ..., y0:y1, :] for t in (rotation, position))
             far = reaches[index[n, 0, y0:y1]]
-            ends = _row_range(y0, y1 - 1, far, Placement(*near, pad))
+            ends = _row_range(y0, y1 - 1, far, Placement(turn, place, pad))
             first, end = (min(max(y + pad, 0), rows) for y in ends)
             pieces.append((src[k], pictures[n], y0, y1, first, np.zeros((end - first + 2, columns + 2, 4))))
         run_all(kernel, pieces)

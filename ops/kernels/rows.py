@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.types.containers import UniTuple
 from numba.extending import intrinsic
 
 _D4 = ir.VectorType(ir.DoubleType(), 4)
@@ -96,7 +97,7 @@ def draw_rows(typingctx, band, o, stride, src, p, rows, span):  # type: ignore[n
         return context.get_dummy_value()
 
     i64 = types.int64
-    return types.void(band, i64, i64, src, i64, rows, types.UniTuple(i64, 2)), build
+    return types.void(band, i64, i64, src, i64, rows, UniTuple(i64, 2)), build
 
 
 @intrinsic
@@ -118,7 +119,7 @@ def gather_rows(typingctx, sums, o, stride, rows, span, found):  # type: ignore[
         return context.get_dummy_value()
 
     i64 = types.int64
-    return types.void(sums, i64, i64, rows, types.UniTuple(i64, 2), found), build
+    return types.void(sums, i64, i64, rows, UniTuple(i64, 2), found), build
 
 
 @intrinsic
