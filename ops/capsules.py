@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from torchbokeh.ops.checks import check_image
 from torchbokeh.ops.dispatch import has_kernel
+from torchbokeh.ops.points import flatten, unflatten
 from torchbokeh.ops.spans import MIN_RADIUS
 
 FINE = 2
@@ -57,9 +58,9 @@ class _Capsules(torch.autograd.Function):
     @staticmethod
     def forward(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
         if has_kernel(values):
-            from torchbokeh.ops.kernels import capsules as _capsule_kernels
+            from torchbokeh.ops.kernels import capsules as kernels
 
-            return _capsule_kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
+            return kernels.splat_capsules(*(t.detach() for t in (values, pixels, radius, motion, centre)))
         return _splat_capsules_torch(values, pixels, radius, motion, centre)
 
     @staticmethod
@@ -74,30 +75,21 @@ class _Capsules(torch.autograd.Function):
         return by_values, None, *by_geometry
 
 
-def _flat(t: Tensor) -> Tensor:
-    return t.movedim(1, 0).reshape(t.shape[1], -1)
-
-
-def _unflat(t: Tensor, like: Tensor) -> Tensor:
-    b, c, h, w = like.shape
-    return t.reshape(c, b, h, w).movedim(0, 1)
-
-
 def _splat_capsules_torch(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
-    flat = _flat(values)
+    flat = flatten(values)
     out = torch.zeros_like(flat)
     for here, places in _pieces(pixels, radius, motion, centre):
         target, inside = _targets(pixels[here], places, values.shape)
         share = torch.where(inside, _shares(places, radius[here], motion[here], centre[here]), 0.0)
         out.index_add_(1, target.flatten(), (flat[:, pixels[here], None] * share).flatten(1))
-    return _unflat(out, values)
+    return unflatten(out, values)
 
 
 def _gather_capsules(
     grad: Tensor, values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor
 ) -> list[Tensor]:
     """Gradients of ``values, radius, motion, centre``; ``grad`` is that of the picture."""
-    flat, slopes = _flat(values), _flat(grad)
+    flat, slopes = flatten(values), flatten(grad)
     by_values = torch.zeros_like(flat)
     by_geometry = [torch.zeros_like(t) for t in (radius, motion, centre)]
     for here, places in _pieces(pixels, radius, motion, centre):
@@ -110,7 +102,7 @@ def _gather_capsules(
         by_share = (arriving * flat[:, pixels[here], None]).sum(0)
         for whole, part in zip(by_geometry, torch.autograd.grad(share, leaves, by_share), strict=True):
             whole[here] = part
-    return [_unflat(by_values, values), *by_geometry]
+    return [unflatten(by_values, values), *by_geometry]
 
 
 def _pieces(pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Iterator[tuple[slice, Tensor]]:

@@ -22,7 +22,7 @@ given radii, once for each level, in whatever domain that function works.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -185,16 +185,15 @@ def merged(
     """
     levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, weight), weight, labels)
 
-    def picture(level: int) -> Tensor:
-        margin = MARGIN if level else 0
-        maps = [F.pad(t, (margin,) * 4) for t in levels[level]]
-        out = splat(*maps) if labels is None else splat(*maps, 2**level)
-        if level == highest:
-            return out
-        start, (h, w) = 2 * MARGIN - margin, out.shape[2:]
-        return out + upsample(picture(level + 1))[..., start : start + h, start : start + w] / 4
-
-    return picture(0)
+    pictures = []
+    for level, cells in enumerate(levels):
+        maps = [F.pad(t, (MARGIN if level else 0,) * 4) for t in cells]
+        pictures.append(splat(*maps) if labels is None else splat(*maps, 2**level))
+    out = pictures[highest]
+    for level in range(highest - 1, -1, -1):
+        start, (h, w) = MARGIN if level else 2 * MARGIN, pictures[level].shape[2:]
+        out = pictures[level] + upsample(out)[..., start : start + h, start : start + w] / 4
+    return out
 
 
 def splat_merged(
@@ -263,7 +262,7 @@ def splat_merged(
         out = torch.cat([source * radius, radius], 1) if ones else source * radius
     elif has_kernel(source) and fixed:
         knots, bulge = profile.knots.double(), profile.bulge.double()
-        out = _splat_merged_op(source, radius, weight, knots, bulge, *merging, highest, ones, normalise)
+        out = _splat_merged_op(source, radius, weight, [knots, bulge], merging, highest, ones, normalise)
     else:
         if ones:
             source = torch.cat([source, torch.ones_like(radius)], 1)
@@ -278,34 +277,22 @@ def _splat_merged_op(
     values: Tensor,
     coc: Tensor,
     weight: Tensor | None,
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
+    profile: Sequence[Tensor],
+    merging: Sequence[float],
     highest: int,
     ones: bool,
     normalise: bool,
 ) -> Tensor:
-    from torchbokeh.ops.kernels import merge as _merge_kernels
+    from torchbokeh.ops.kernels import merge as kernels
 
-    merging = Merging(cells, highlight)
-    return _merge_kernels.splat_merged(values, coc, weight, Profile(knots, bulge), merging, highest, ones, normalise)
+    shape, extent = Profile(*profile), Merging(*merging)
+    return kernels.splat_merged(values, coc, weight, shape, extent, highest, ones, normalise)
 
 
 @_splat_merged_op.register_fake
-def _(
-    values: Tensor,
-    coc: Tensor,
-    weight: Tensor | None,
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
-    highest: int,
-    ones: bool,
-    normalise: bool,
-) -> Tensor:
+def _(values: Tensor, *settings: Any) -> Tensor:
     b, c, h, w = values.shape
+    *_, ones, _ = settings
     return values.new_empty(b, c + ones, h, w)
 
 
@@ -316,32 +303,19 @@ def _gather_merged_op(
     values: Tensor,
     coc: Tensor,
     weight: Tensor | None,
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
+    profile: Sequence[Tensor],
+    merging: Sequence[float],
     highest: int,
-    ones: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    from torchbokeh.ops.kernels import merge_gather as _merge_gather
+    from torchbokeh.ops.kernels import merge_gather as kernels
 
-    merging = Merging(cells, highlight)
-    return _merge_gather.gather_merged(grad, out, values, coc, weight, Profile(knots, bulge), merging, highest, ones)
+    shape, extent = Profile(*profile), Merging(*merging)
+    return kernels.gather_merged(grad, out, values, coc, weight, shape, extent, highest)
 
 
 @_gather_merged_op.register_fake
 def _(
-    grad: Tensor,
-    out: Tensor | None,
-    values: Tensor,
-    coc: Tensor,
-    weight: Tensor | None,
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
-    highest: int,
-    ones: bool,
+    grad: Tensor, out: Tensor | None, values: Tensor, coc: Tensor, weight: Tensor | None, *settings: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
     b, _, h, w = values.shape
     by_weight = values.new_empty((b, 1, 0, 0) if weight is None else (b, 1, h, w))
@@ -349,15 +323,14 @@ def _(
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, cells, highlight, highest, ones, normalise = inputs
-    ctx.settings = cells, highlight, highest, ones
-    ctx.save_for_backward(*tensors, output if normalise else None)
+    values, coc, weight, profile, *ctx.settings, _, normalise = inputs
+    ctx.save_for_backward(output if normalise else None, values, coc, weight, *profile)
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    *tensors, out = ctx.saved_tensors
-    by_values, by_coc, by_weight = _gather_merged_op(grad, out, *tensors, *ctx.settings)
-    return by_values, by_coc, None if tensors[2] is None else by_weight, *[None] * 7
+    *tensors, knots, bulge = ctx.saved_tensors
+    by_values, by_coc, by_weight = _gather_merged_op(grad, *tensors, [knots, bulge], *ctx.settings)
+    return by_values, by_coc, None if tensors[3] is None else by_weight, [None, None], *[None] * 4
 
 
 _splat_merged_op.register_autograd(_backward, setup_context=_setup)

@@ -140,9 +140,9 @@ def render_planes(
     leaves = (inverse, *(texture for pyramid in plates.levels for texture in pyramid))
     grads = torch.is_grad_enabled() and any(t.requires_grad for t in leaves)
     if count and has_kernel(texels) and not grads:
-        from torchbokeh.ops.kernels import planes as _plane_kernels
+        from torchbokeh.ops.kernels import planes as kernels
 
-        return _plane_kernels.render_planes(plates, inverse, level, size, parents, frames)
+        return kernels.render_planes(plates, inverse, level, size, parents, frames)
     return _render_planes_torch(plates, inverse, level, size, parents, frames)
 
 

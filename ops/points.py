@@ -32,6 +32,14 @@ class PointTable(NamedTuple):
     counts: Tensor
 
 
+class Placement(NamedTuple):
+    """Where the PSFs go: ``rotation``, ``position`` and ``pad`` of `splat_points`, as far as they are given."""
+
+    rotation: Tensor | None
+    position: Tensor | None
+    pad: int
+
+
 def splat_points(
     values: Tensor,
     index: Tensor,
@@ -106,9 +114,7 @@ def splat_points(
     out = _splat_points_op(
         values.to(compute_dtype(values)),
         index.long(),
-        table.offsets,
-        table.weights,
-        table.counts.long(),
+        [table.offsets, table.weights, table.counts.long()],
         None if rotation is None else rotation.to(work),
         None if position is None else position.to(work),
         pad,
@@ -129,15 +135,21 @@ def _check_contents(index: Tensor, points: Tensor, counts: Tensor) -> None:
         raise ValueError(f"index: expected 0 to {psfs - 1}, a PSF of the table, got {low} to {high}")
 
 
-def _flatten(t: Tensor) -> Tensor:
+def flatten(t: Tensor) -> Tensor:
     """``(B, ..., H, W) -> (..., B*H*W)``."""
     return t.movedim(0, -3).reshape(*t.shape[1:-2], -1)
 
 
-def _unflatten(t: Tensor, like: Tensor) -> Tensor:
-    """Undo `_flatten`, in the shape and dtype of ``like``."""
+def unflatten(t: Tensor, like: Tensor) -> Tensor:
+    """Undo `flatten`, in the shape and dtype of ``like``."""
     b, *inner, h, w = like.shape
     return t.reshape(*inner, b, h, w).movedim(-3, 0).to(like.dtype).contiguous()
+
+
+def _flattened(placement: Placement) -> Placement:
+    """The placement of flat pixels."""
+    rotation, position = (None if t is None else flatten(t) for t in placement[:2])
+    return Placement(rotation, position, placement.pad)
 
 
 def _expand(index: Tensor, counts: Tensor, alive: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -161,20 +173,14 @@ def _expand(index: Tensor, counts: Tensor, alive: Tensor) -> Iterator[tuple[Tens
 
 
 def _targets(
-    pixels: Tensor,
-    offsets: Tensor,
-    rotation: Tensor | None,
-    position: Tensor | None,
-    source: tuple[int, int],
-    size: Sequence[int],
-    pad: int,
+    pixels: Tensor, offsets: Tensor, placement: Placement, source: torch.Size, size: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """For points at ``offsets`` from their ``pixels``: the upper left of four cells, and the shares right and down.
 
-    ``pixels`` are flat indices into ``(B, H, W)`` with ``(H, W)`` the shape of the ``source``, as for
-    ``rotation (2, 2, B*H*W)`` and ``position (2, B*H*W)``; cells are flat indices into the padded buffer with
-    its margin.
+    ``pixels`` are flat indices into ``(B, H, W)`` with ``(H, W)`` the shape of the ``source``; the ``placement`` is
+    flat as well, ``(2, 2, B*H*W)`` and ``(2, B*H*W)``. Cells are flat indices into the padded buffer with its margin.
     """
+    rotation, position, pad = placement
     (rows, columns), (h, w) = source, size
     target = offsets.T
     if rotation is not None:
@@ -192,24 +198,16 @@ def _targets(
 
 
 def _splat_points_torch(
-    values: Tensor,
-    index: Tensor,
-    points: Tensor,
-    counts: Tensor,
-    rotation: Tensor | None,
-    position: Tensor | None,
-    pad: int,
-    size: Sequence[int],
+    values: Tensor, index: Tensor, points: Tensor, counts: Tensor, placement: Placement, size: Sequence[int]
 ) -> Tensor:
-    b, c, h, w = values.shape
-    rows, columns = (n + 2 * (pad + _MARGIN) for n in size)
+    b, c = values.shape[:2]
+    rows, columns = (n + 2 * (placement.pad + _MARGIN) for n in size)
     work = working_dtype(values.device)
-    flat = _flatten(values).to(work)
-    turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
+    flat, flat_placement = flatten(values).to(work), _flattened(placement)
     out = torch.zeros(c, b * rows * columns, dtype=work, device=values.device)
     for pixels, numbers in _expand(index, counts, (flat != 0).any(0)):
         here = points.index_select(0, numbers)
-        cell, right, down = _targets(pixels, here[:, :2], turn, place, (h, w), size, pad)
+        cell, right, down = _targets(pixels, here[:, :2], flat_placement, values.shape[2:], size)
         source = flat.index_select(1, pixels) * here[:, 2]
         for step, share in (
             (0, (1 - down) * (1 - right)),
@@ -224,34 +222,25 @@ def _splat_points_torch(
 
 
 def _gather_points_torch(
-    grad: Tensor,
-    values: Tensor,
-    index: Tensor,
-    points: Tensor,
-    counts: Tensor,
-    rotation: Tensor | None,
-    position: Tensor | None,
-    pad: int,
-    size: Sequence[int],
-    geometry: bool,
+    grad: Tensor, values: Tensor, index: Tensor, points: Tensor, counts: Tensor, placement: Placement, geometry: bool
 ) -> list[Tensor]:
     """Gradients of ``values`` and, if ``geometry``, of ``points``, ``rotation`` and ``position`` as far as given.
 
     The splat is linear in the buffer, so this is the gradient of ``sum(value * weight * g(target))`` with ``g`` the
     incoming gradient, interpolated bilinearly.
     """
-    h, w = values.shape[-2:]
-    stride = size[1] + 2 * (pad + _MARGIN)
+    size = [n - 2 * placement.pad for n in grad.shape[-2:]]
+    stride = grad.shape[-1] + 2 * _MARGIN
     work = working_dtype(values.device)
-    g = _flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
-    flat = _flatten(values).to(work)
-    turn, place = (None if t is None else _flatten(t) for t in (rotation, position))
+    g = flatten(torch.nn.functional.pad(grad.to(work), (_MARGIN,) * 4))
+    flat, flat_placement = flatten(values).to(work), _flattened(placement)
+    turn, place, _ = flat_placement
     by_values, by_points = torch.zeros_like(flat), torch.zeros_like(points)
     by_turn, by_place = (None if t is None else torch.zeros_like(t) for t in (turn, place))
     for pixels, numbers in _expand(index, counts, torch.ones_like(index, dtype=torch.bool).reshape(-1)):
         here = points.index_select(0, numbers)
         offsets, weights = here[:, :2], here[:, 2]
-        cell, right, down = _targets(pixels, offsets, turn, place, (h, w), size, pad)
+        cell, right, down = _targets(pixels, offsets, flat_placement, values.shape[2:], size)
         a, b, c, d = (g.index_select(1, cell + step) for step in (0, 1, stride, stride + 1))
         upper, lower = a + right * (b - a), c + right * (d - c)
         mass = upper + down * (lower - upper)
@@ -268,11 +257,11 @@ def _gather_points_torch(
             by_turn.index_add_(2, pixels, move[:, None] * offsets.T)
             move = (turn.index_select(2, pixels) * move[:, None]).sum(0)
         by_points.index_add_(0, numbers, torch.stack([*move, (value * mass).sum(0)], 1))
-    grads = [_unflatten(by_values, values)]
+    grads = [unflatten(by_values, values)]
     if geometry:
         grads.append(by_points)
-        frame = ((by_turn, rotation), (by_place, position))
-        grads += [_unflatten(t, like) for t, like in frame if t is not None and like is not None]
+        frame = ((by_turn, placement.rotation), (by_place, placement.position))
+        grads += [unflatten(t, like) for t, like in frame if t is not None and like is not None]
     return grads
 
 
@@ -286,35 +275,25 @@ def _packed(offsets: Tensor, weights: Tensor) -> Tensor:
 def _splat_points_op(
     values: Tensor,
     index: Tensor,
-    offsets: Tensor,
-    weights: Tensor,
-    counts: Tensor,
+    table: Sequence[Tensor],
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
     size: Sequence[int],
 ) -> Tensor:
+    offsets, weights, counts = table
     _check_contents(index, offsets, counts)
-    points = _packed(offsets, weights)
+    points, placement = _packed(offsets, weights), Placement(rotation, position, pad)
     if has_kernel(values):
-        from torchbokeh.ops.kernels import points as _point_kernels
+        from torchbokeh.ops.kernels import points as kernels
 
-        return _point_kernels.splat_points(values, index, points, counts, rotation, position, pad, size)
-    return _splat_points_torch(values, index, points, counts, rotation, position, pad, size)
+        return kernels.splat_points(values, index, points, counts, placement, size)
+    return _splat_points_torch(values, index, points, counts, placement, size)
 
 
 @_splat_points_op.register_fake
-def _(
-    values: Tensor,
-    index: Tensor,
-    offsets: Tensor,
-    weights: Tensor,
-    counts: Tensor,
-    rotation: Tensor | None,
-    position: Tensor | None,
-    pad: int,
-    size: Sequence[int],
-) -> Tensor:
+def _(values: Tensor, index: Tensor, *settings: Any) -> Tensor:
+    *_, pad, size = settings
     return values.new_empty(*values.shape[:2], *(n + 2 * pad for n in size))
 
 
@@ -323,61 +302,44 @@ def _gather_points_op(
     grad: Tensor,
     values: Tensor,
     index: Tensor,
-    offsets: Tensor,
-    weights: Tensor,
-    counts: Tensor,
+    table: Sequence[Tensor],
     rotation: Tensor | None,
     position: Tensor | None,
     pad: int,
-    size: Sequence[int],
     geometry: bool,
 ) -> list[Tensor]:
-    points = _packed(offsets, weights)
+    offsets, weights, counts = table
+    points, placement = _packed(offsets, weights), Placement(rotation, position, pad)
     if has_kernel(values) and not geometry:
-        from torchbokeh.ops.kernels import points as _point_kernels
+        from torchbokeh.ops.kernels import points as kernels
 
-        return [_point_kernels.gather_points(grad, index, points, counts, rotation, position, pad)]
-    return _gather_points_torch(grad, values, index, points, counts, rotation, position, pad, size, geometry)
+        return [kernels.gather_points(grad, index, points, counts, placement)]
+    return _gather_points_torch(grad, values, index, points, counts, placement, geometry)
 
 
 @_gather_points_op.register_fake
-def _(
-    grad: Tensor,
-    values: Tensor,
-    index: Tensor,
-    offsets: Tensor,
-    weights: Tensor,
-    counts: Tensor,
-    rotation: Tensor | None,
-    position: Tensor | None,
-    pad: int,
-    size: Sequence[int],
-    geometry: bool,
-) -> list[Tensor]:
-    like = [torch.empty_like(values, memory_format=torch.contiguous_format)]
-    if geometry:
-        like.append(_packed(offsets, weights))
-        like += [
-            torch.empty_like(t, memory_format=torch.contiguous_format) for t in (rotation, position) if t is not None
-        ]
-    return like
+def _(grad: Tensor, values: Tensor, index: Tensor, table: Sequence[Tensor], *settings: Any) -> list[Tensor]:
+    (offsets, weights, _), (rotation, position, _, geometry) = table, settings
+    wanted = (values, _packed(offsets, weights), rotation, position) if geometry else (values,)
+    return [torch.empty_like(t, memory_format=torch.contiguous_format) for t in wanted if t is not None]
 
 
 def _points_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    *tensors, ctx.pad, ctx.size = inputs
-    ctx.save_for_backward(*tensors)
+    values, index, table, rotation, position, ctx.pad, _ = inputs
+    ctx.save_for_backward(values, index, *table, rotation, position)
 
 
-def _points_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    _, _, offsets, weights, _, rotation, position = ctx.saved_tensors
-    geometry = any(ctx.needs_input_grad[k] for k in (2, 3, 5, 6))
-    by_values, *rest = _gather_points_op(grad, *ctx.saved_tensors, ctx.pad, ctx.size, geometry)
+def _points_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    values, index, *table, rotation, position = ctx.saved_tensors
+    needs = ctx.needs_input_grad
+    geometry = any(needs[2]) or needs[3] or needs[4]
+    by_values, *found = _gather_points_op(grad, values, index, table, rotation, position, ctx.pad, geometry)
     if not geometry:
-        return by_values, *[None] * 8
-    by_points, *found = rest
+        return by_values, None, [None] * 3, *[None] * 4
+    by_points, *found = found
     by_rotation, by_position = (None if t is None else found.pop(0) for t in (rotation, position))
-    by_offsets, by_weights = by_points[:, :2].to(offsets.dtype), by_points[:, 2].to(weights.dtype)
-    return by_values, None, by_offsets, by_weights, None, by_rotation, by_position, None, None
+    by_table = [by_points[:, :2].to(table[0].dtype), by_points[:, 2].to(table[1].dtype), None]
+    return by_values, None, by_table, by_rotation, by_position, None, None
 
 
 _splat_points_op.register_autograd(_points_backward, setup_context=_points_setup)

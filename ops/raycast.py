@@ -94,9 +94,9 @@ def subsample_blur(
     missed = colour if background is None else background
     grads = torch.is_grad_enabled() and (colour.requires_grad or missed.requires_grad)
     if has_kernel(colour) and coc.dtype == missed.dtype == torch.float32 and not grads:
-        from torchbokeh.ops.kernels import raycast as _raycast_kernels
+        from torchbokeh.ops.kernels import raycast as kernels
 
-        return _raycast_kernels.subsample_blur(colour, coc, views, far, background, iterations, tolerance)
+        return kernels.subsample_blur(colour, coc, views, far, background, iterations, tolerance)
     dtype = compute_dtype(colour)
     out = _subsample_blur_torch(
         colour.to(dtype), coc.to(working_dtype(coc.device)), views, reach, far, missed.to(dtype), iterations, tolerance

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_kind
+from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 310.0, 2300.0
@@ -98,7 +99,7 @@ def refractive_index(glass: str, wavelength: float | Tensor) -> float | Tensor:
             raise ValueError(f"wavelength: expected {LOW:g} to {HIGH:g} nm, got {wrong[0].item():g}")
         squares = (wavelength.to(working_dtype(wavelength.device)) / 1000).square()
         index = sum((b * squares / (squares - c) for b, c in terms), torch.ones_like(squares)).sqrt()
-        return index.to(torch.promote_types(wavelength.dtype, torch.float32))
+        return index.to(compute_dtype(wavelength))
     if not isinstance(wavelength, Real) or isinstance(wavelength, bool):
         raise TypeError(f"wavelength: expected a number or a tensor, got {type(wavelength).__name__}")
     if not LOW <= wavelength <= HIGH:

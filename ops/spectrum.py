@@ -10,8 +10,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchbokeh.ops import cie_1931 as _cie_1931
+from torchbokeh.ops import cie_1931
 from torchbokeh.ops.checks import check_flag, check_image
+from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.spans import working_dtype
 
 LOW, HIGH = 380.0, 780.0
@@ -54,7 +55,7 @@ def xyz(wavelength: Tensor) -> Tensor:
         [0.0, 0.0, 0.0]
     """
     _check_wavelength(wavelength)
-    return _matching(_working(wavelength)).to(_dtype_for(wavelength))
+    return _matching(_working(wavelength)).to(compute_dtype(wavelength))
 
 
 def linear_rgb(wavelength: Tensor, formula: Formula = "cie") -> Tensor:
@@ -85,7 +86,7 @@ def linear_rgb(wavelength: Tensor, formula: Formula = "cie") -> Tensor:
         [1]
     """
     _check_wavelength(wavelength)
-    return _rgb(_working(wavelength), formula).to(_dtype_for(wavelength))
+    return _rgb(_working(wavelength), formula).to(compute_dtype(wavelength))
 
 
 def spectral_samples(
@@ -137,7 +138,7 @@ def spectral_samples(
     else:
         wavelength = LOW + (HIGH - LOW) * points
         rgb = _rgb(wavelength, formula) * _weights(weight, wavelength)[:, None]
-    dtype = _dtype_for(unit)
+    dtype = compute_dtype(unit)
     return wavelength.to(dtype), _shares(rgb).to(dtype)
 
 
@@ -186,7 +187,7 @@ def spectral_bands(edges: Tensor, weight: Weight = None, formula: Formula = "cie
     lit = power > torch.finfo(power.dtype).eps * integrals[-1, 3]  # what is less is rounding of the integrals
     middle = 0.5 * (cuts[:-1] + cuts[1:])
     centre = torch.where(lit, moment / torch.where(lit, power, 1), middle)
-    dtype = _dtype_for(edges)
+    dtype = compute_dtype(edges)
     return centre.clamp(cuts[:-1], cuts[1:]).to(dtype), _shares(rgb).to(dtype)
 
 
@@ -202,16 +203,12 @@ def _working(values: Tensor) -> Tensor:
     return values.to(working_dtype(values.device))
 
 
-def _dtype_for(values: Tensor) -> torch.dtype:
-    return torch.promote_types(values.dtype, torch.float32)
-
-
 def _matching(wavelength: Tensor) -> Tensor:
-    table = wavelength.new_tensor(_cie_1931.MATCHING)
-    place = (wavelength - _cie_1931.FIRST) / _cie_1931.STEP
+    table = wavelength.new_tensor(cie_1931.MATCHING)
+    place = (wavelength - cie_1931.FIRST) / cie_1931.STEP
     row = place.detach().long().clamp(0, len(table) - 2)
     values = torch.lerp(table[row], table[row + 1], (place - row)[..., None])
-    outside = (wavelength < _cie_1931.FIRST) | (wavelength > _cie_1931.LAST)
+    outside = (wavelength < cie_1931.FIRST) | (wavelength > cie_1931.LAST)
     return values.masked_fill(outside[..., None], 0)
 
 
@@ -243,7 +240,7 @@ def _ramp(wavelength: Tensor, knots: tuple[tuple[float, float], ...]) -> Tensor:
 @cache
 def _means(formula: Formula) -> tuple[float, ...]:
     """Mean of each channel from `LOW` to `HIGH`, before the scale."""
-    knots = torch.linspace(LOW, HIGH, len(_cie_1931.MATCHING), dtype=torch.float64, device="cpu")
+    knots = torch.linspace(LOW, HIGH, len(cie_1931.MATCHING), dtype=torch.float64, device="cpu")
     value = _unclipped(knots, formula)
     if formula == "cie":
         # Linear between the knots, with the negative part cut off: of ends a > 0 > b only a triangle stays.

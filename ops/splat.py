@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchbokeh.ops.checks import check_flag, check_image
 from torchbokeh.ops.dispatch import compute_dtype, has_kernel
-from torchbokeh.ops.points import PointTable, splat_points
+from torchbokeh.ops.points import PointTable, flatten, splat_points, unflatten
 from torchbokeh.ops.span_gradient import row_span_gradient
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, row_span, working_dtype
 
@@ -94,7 +94,7 @@ def _row_ends(coc: Tensor, row: int, profile: Profile, size: tuple[int, int]) ->
 def _splat_spans_torch(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
     b, c, h, w = values.shape
     work = working_dtype(values.device)
-    flat = values.movedim(1, 0).reshape(c, -1).to(work)
+    flat = flatten(values).to(work)
     radius = clamp_radius(coc.reshape(-1).to(work))
     out = torch.zeros(c, b * h * (w + 2), dtype=work, device=values.device)
     for row in _rows(radius, h):
@@ -121,10 +121,10 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
     The splat is linear in the buffer, so its backward pass is the gradient of
     ``sum(value * weight * (g(left) - g(right)))`` with ``g`` the incoming gradient, interpolated linearly.
     """
-    b, c, h, w = values.shape
+    h, w = values.shape[2:]
     work = working_dtype(values.device)
-    g = torch.nn.functional.pad(grad.to(work), (0, 2)).movedim(1, 0).reshape(c, -1)
-    flat = values.movedim(1, 0).reshape(c, -1).to(work)
+    g = flatten(torch.nn.functional.pad(grad.to(work), (0, 2)))
+    flat = flatten(values).to(work)
     radius = clamp_radius(coc.reshape(-1).to(work))
     by_values, by_coc = torch.zeros_like(flat), torch.zeros_like(radius)
     by_knots, by_bulge = torch.zeros_like(profile.knots), torch.zeros_like(profile.bulge)
@@ -142,21 +142,16 @@ def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Prof
         by_knots += by_row[1]
         by_bulge += by_row[2]
     by_coc = by_coc.reshape(coc.shape) * (coc.abs() > MIN_RADIUS)
-    return [
-        by_values.reshape(c, b, h, w).movedim(0, 1).to(values.dtype).contiguous(),
-        by_coc.to(coc.dtype),
-        by_knots,
-        by_bulge,
-    ]
+    return [unflatten(by_values, values), by_coc.to(coc.dtype), by_knots, by_bulge]
 
 
 @torch.library.custom_op("torchbokeh::splat_spans", mutates_args=())
 def _splat_spans_op(values: Tensor, coc: Tensor, knots: Tensor, bulge: Tensor, integrate: bool) -> Tensor:
     profile = Profile(knots, bulge)
     if has_kernel(values):
-        from torchbokeh.ops.kernels import splat as _span_kernels
+        from torchbokeh.ops.kernels import splat as kernels
 
-        return _span_kernels.splat_spans(values, coc, profile, integrate)
+        return kernels.splat_spans(values, coc, profile, integrate)
     return _splat_spans_torch(values, coc, profile, integrate)
 
 
@@ -171,9 +166,9 @@ def _gather_spans_op(
 ) -> list[Tensor]:
     profile = Profile(knots, bulge)
     if has_kernel(values) and not shape:
-        from torchbokeh.ops.kernels import splat as _span_kernels
+        from torchbokeh.ops.kernels import splat as kernels
 
-        grads = _span_kernels.gather_spans(grad, values, coc, profile)
+        grads = kernels.gather_spans(grad, values, coc, profile)
         return [*grads, torch.zeros_like(knots), torch.zeros_like(bulge)]
     return _gather_spans_torch(grad, values, coc, profile)
 

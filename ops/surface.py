@@ -57,7 +57,7 @@ def blur_surface(
         t is not None and t.requires_grad for t in (colour, weight, coc, profile.knots, profile.bulge)
     )
     if has_kernel(colour) and colour.shape[1] <= 3 and colour.numel() and not asked:
-        out = _blur_surface_op(colour, coc, weights, *profile, *merging, highest)
+        out = _blur_surface_op(colour, coc, weights, profile, merging, highest)
         return out[0], out[1]
     bins = []
     for share in weights:
@@ -71,16 +71,13 @@ def _blur_surface_op(
     colour: Tensor,
     coc: Tensor,
     weights: Sequence[Tensor | None],
-    knots: Tensor,
-    bulge: Tensor,
-    cells: float,
-    highlight: float,
+    profile: Sequence[Tensor],
+    merging: Sequence[float],
     highest: int,
 ) -> list[Tensor]:
-    from torchbokeh.ops.kernels import surface as _surface_kernels
+    from torchbokeh.ops.kernels import surface as kernels
 
-    merging = Merging(cells, highlight)
-    return [*_surface_kernels.blur_surface(colour, coc, weights, Profile(knots, bulge), merging, highest)]
+    return [*kernels.blur_surface(colour, coc, weights, Profile(*profile), Merging(*merging), highest)]
 
 
 @_blur_surface_op.register_fake

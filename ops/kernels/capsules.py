@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.capsules import FINE
+from torchbokeh.ops.points import flatten, unflatten
 from torchbokeh.ops.spans import MIN_RADIUS
 
 
@@ -56,9 +57,8 @@ def _splat(flat, pixels, radius, motion, centre, height, width, out):  # type: i
 
 def splat_capsules(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tensor, centre: Tensor) -> Tensor:
     """`torchbokeh.ops.capsules.splat_capsules` for CPU float32, on one thread."""
-    b, c, h, w = values.shape
-    flat = values.movedim(1, 0).reshape(c, -1).contiguous()
+    flat = flatten(values).contiguous()
     out = np.zeros(flat.shape)
     geometry = (t.double().contiguous().numpy() for t in (radius, motion, centre))
-    _splat(flat.numpy(), pixels.numpy(), *geometry, h, w, out)
-    return torch.from_numpy(out).to(values.dtype).reshape(c, b, h, w).movedim(0, 1).contiguous()
+    _splat(flat.numpy(), pixels.numpy(), *geometry, *values.shape[2:], out)
+    return unflatten(torch.from_numpy(out), values)

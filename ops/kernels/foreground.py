@@ -4,6 +4,7 @@ The same numbers as the torch functions of `torchbokeh.compose.surfaces`, each i
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -16,6 +17,13 @@ BLOCK = 4
 """Pixels of a block each way."""
 
 
+class Layer(NamedTuple):
+    """A picture ``(C, H, W)``, and a map of it ``(H, W)``: its CoC, or the coverage of its splats."""
+
+    colour: np.ndarray
+    map: np.ndarray
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _front(row, start, stop, out):  # type: ignore[no-untyped-def]
     scale = np.float32(1.0) / (stop - start)
@@ -24,7 +32,8 @@ def _front(row, start, stop, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _split(image, coc, start, stop, front, known, sums, y0, y1):  # type: ignore[no-untyped-def]
+def _split(scene, between, front, known, sums, y0, y1):  # type: ignore[no-untyped-def]
+    (image, coc), (start, stop) = scene, between
     channels, height, width = image.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     near, widest = np.empty(width, np.float32), np.empty(width + 2, np.float32)
@@ -70,7 +79,8 @@ def split(image: np.ndarray, coc: np.ndarray, start: float, stop: float) -> tupl
     channels, height, width = image.shape
     front, known = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     sums = np.empty((4 + channels, -(-height // BLOCK), -(-width // BLOCK)), np.float32)
-    work = partial(_split, image, coc, np.float32(start), np.float32(stop), front, known, sums)
+    between = np.float32(start), np.float32(stop)
+    work = partial(_split, Layer(image, coc), between, front, known, sums)
     run_all(work, bands(height), "split")
     return front, known, sums / np.float32(BLOCK**2)
 
@@ -95,7 +105,8 @@ def _enlarge(small, y, line, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _rest(image, coc, known, hidden, hidden_coc, out, out_coc, y0, y1):  # type: ignore[no-untyped-def]
+def _rest(scene, known, behind, target, y0, y1):  # type: ignore[no-untyped-def]
+    (image, coc), (hidden, hidden_coc), (out, out_coc) = scene, behind, target
     channels, _, width = image.shape
     line, large = np.empty(hidden.shape[2] + 2, np.float32), np.empty(BLOCK * hidden.shape[2], np.float32)
     for y in range(y0, y1):
@@ -105,22 +116,22 @@ def _rest(image, coc, known, hidden, hidden_coc, out, out_coc, y0, y1):  # type:
             least = min(least, seen[x])
         for k in range(channels + 1):
             source, small = (image[k, y], hidden[k]) if k < channels else (coc[y], hidden_coc)
-            target = out[k, y] if k < channels else out_coc[y]
+            row = out[k, y] if k < channels else out_coc[y]
             if least == 1.0:
-                target[:] = source
+                row[:] = source
                 continue
             _enlarge(small, y, line, large)
             for x in range(width):
-                target[x] = seen[x] * source[x] + (np.float32(1.0) - seen[x]) * large[x]
+                row[x] = seen[x] * source[x] + (np.float32(1.0) - seen[x]) * large[x]
 
 
 def rest(
     image: np.ndarray, coc: np.ndarray, known: np.ndarray, hidden: np.ndarray, hidden_coc: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The picture ``(C, H, W)`` and CoC ``(H, W)`` without foreground: what is hidden comes from block means."""
-    out, out_coc = np.empty_like(image), np.empty_like(coc)
-    run_all(partial(_rest, image, coc, known, hidden, hidden_coc, out, out_coc), bands(len(coc)), "split")
-    return out, out_coc
+    out = Layer(np.empty_like(image), np.empty_like(coc))
+    run_all(partial(_rest, Layer(image, coc), known, Layer(hidden, hidden_coc), out), bands(len(coc)), "split")
+    return out
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -137,13 +148,14 @@ def _double(half, y, beyond, line, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _over(colour, coverage, front, half, beyond, certain, behind, density, y0, y1):  # type: ignore[no-untyped-def]
+def _over(ahead, front, half, beyond, certain, behind, y0, y1):  # type: ignore[no-untyped-def]
+    (colour, coverage), (target, density) = ahead, behind
     channels, _, width = colour.shape
     zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(TINY)
     line, large = np.empty(half.shape[1], np.float32), np.empty(width + (width & 1), np.float32)
     share, rest = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(y0, y1):
-        covered, ahead, crowd = coverage[y], front[y], density[y]
+        covered, share_ahead, count = coverage[y], front[y], density[y]
         most = zero
         for x in range(width):
             most = max(most, covered[x])
@@ -154,15 +166,15 @@ def _over(colour, coverage, front, half, beyond, certain, behind, density, y0, y
             whole = max(large[x], zero)
             stopped = min(covered[x] / max(whole, tiny), one)
             known = min(certain * whole, one)
-            absent = one if ahead[x] == zero else zero
+            absent = one if share_ahead[x] == zero else zero
             vote = stopped * known
-            left = (absent + known * (one - stopped - absent)) * min(certain * crowd[x], one)
+            left = (absent + known * (one - stopped - absent)) * min(certain * count[x], one)
             total = max(vote + left, tiny * tiny)
             share[x], rest[x] = vote / total, left / total
         for k in range(channels):
-            target, source = behind[k, y], colour[k, y]
+            row, source = target[k, y], colour[k, y]
             for x in range(width):
-                target[x] = share[x] * source[x] + rest[x] * target[x]
+                row[x] = share[x] * source[x] + rest[x] * row[x]
 
 
 def over(
@@ -176,5 +188,5 @@ def over(
     density: np.ndarray,
 ) -> None:
     """Put a foreground over ``behind (C, H, W)``, in place, as `compose` does for the whole lens."""
-    work = partial(_over, colour, coverage, front, half, beyond, np.float32(certain), behind, density)
-    run_all(work, bands(len(front)), "over")
+    ahead, back = Layer(colour, coverage), Layer(behind, density)
+    run_all(partial(_over, ahead, front, half, beyond, np.float32(certain), back), bands(len(front)), "over")

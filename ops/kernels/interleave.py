@@ -61,3 +61,10 @@ def interleave(values: Tensor) -> Tensor:
     if c % 4:
         values = torch.nn.functional.pad(values, (0, 0, 0, 0, 0, 4 * groups - c))
     return values.reshape(b * groups, 4, h, w).permute(0, 2, 3, 1).contiguous()
+
+
+def separate(lanes: Tensor, channels: int) -> Tensor:
+    """Undo `interleave`: ``(B*G, H, W, 4) -> (B, C, H, W)``."""
+    _, h, w, _ = lanes.shape
+    groups = -(-channels // 4)
+    return lanes.permute(0, 3, 1, 2).reshape(-1, 4 * groups, h, w)[:, :channels].contiguous()

@@ -3,7 +3,7 @@
 First one pass over the picture sums the pixels of every level above the lowest into the cells of that level, and notes
 the highlights. Then, from the coarsest level to the finest, bands of rows are splatted, summed along x, and what the
 coarser level holds is interpolated and added. The lowest level reads the picture itself, and writes the result: nothing
-is copied. PSFs come from a `Bank`; only the few that are wider than it are drawn one by one.
+is copied. PSFs come from a `RadiusBank`; only the few that are wider than it are drawn one by one.
 
 Work is cut into pieces that do not depend on the number of threads, and sums run in a fixed order: the result has the
 same bits for every thread count.
@@ -12,6 +12,7 @@ same bits for every thread count.
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -19,10 +20,10 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge_collect import BAND, RECORD, Lanes, Levels, bands, classify, collect
-from torchbokeh.ops.kernels.psf_bank import Bank, draw_psf, psf_bank
+from torchbokeh.ops.kernels.merge_collect import BAND, RECORD, Lanes, Levels, Picture, bands, classify, collect
+from torchbokeh.ops.kernels.radius_bank import RadiusBank, draw_psf, psf_buffer, radius_bank, rounded, rows_within
 from torchbokeh.ops.kernels.rows import draw_rows, running_sum
-from torchbokeh.ops.kernels.splat import shape_tables
+from torchbokeh.ops.kernels.splat import clamped, row_range, shape_of
 from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, STEPS, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.system.threads import run_all, stage
@@ -31,17 +32,40 @@ WIDEST = 32.0
 """Radius in cells up to which PSFs are kept: their number of points grows with its square."""
 
 
+class Band(NamedTuple):
+    """Rows ``y0 .. y1-1`` that are being drawn: ``sums`` of differences along x, flat, ``stride`` numbers to a row."""
+
+    sums: np.ndarray
+    stride: int
+    y0: int
+    y1: int
+
+
+class Row(NamedTuple):
+    """What a row of ``W`` pixels holds on the lowest level.
+
+    Beside what `classify` fills in, and ``energy (W,)`` as scratch: the interleaved ``pixels (4 W,)``, and
+    ``radii (W,)`` in steps of the bank, -1 for a pixel that has nothing there.
+    """
+
+    levels: np.ndarray
+    shares: np.ndarray
+    energy: np.ndarray
+    pixels: np.ndarray
+    radii: np.ndarray
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_wide(band, stride, pad, width, src, p, x, y, coc, shapes, bulge, inv_area, y0, y1, rows, columns, weights):  # type: ignore[no-untyped-def]
-    """Add one PSF that is not in the bank, centred on the cell ``(x, y)``, to the rows ``y0 .. y1-1``."""
-    s = 1 if coc < 0.0 else 0
-    r = max(abs(coc), MIN_RADIUS)
-    first = max(y0 - y, math.ceil(max(r * shapes[s, 0, 0] - 0.5, -1e9)))
-    n = min(y1 - 1 - y, math.floor(min(r * shapes[s, -1, 0] + 0.5, 1e9))) - first + 1
+def _draw_wide(band, pad, src, p, x, y, coc, buffer):  # type: ignore[no-untyped-def]
+    """Add one PSF that is not in the bank, centred on the cell ``(x, y)``."""
+    sums, stride, y0, y1 = band
+    shapes, c = buffer.shape.tables, clamped(coc)
+    s = 1 if c < 0.0 else 0
+    first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
     if n > 0:
-        border = np.float64(width)
-        draw_psf(r, x + 0.5, first, n, 0.0, border, shapes, s, bulge, inv_area, rows, columns, weights)
-        draw_rows(band, (y + first - y0) * stride + 4 * pad, stride, src, p, columns, weights, 0, n)
+        borders = (0.0, np.float64((stride >> 2) - 2 * pad))
+        draw_psf(c, x + 0.5, first, n, borders, buffer)
+        draw_rows(sums, (y + first - y0) * stride + 4 * pad, stride, src, p, buffer.rows, (0, n))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -73,15 +97,29 @@ def cell_radius(cells, p, scale):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _cell_band(cells, reach, rows, level, bank, shape, coarse, out, band, y0, y1):  # type: ignore[no-untyped-def]
-    """Rows ``y0 .. y1-1`` of a level above the lowest: ``out (rows + 2*MARGIN, columns + 2*MARGIN, 4)``."""
-    bank_steps, mirrored, pad, firsts, ends, columns, weights, _ = bank
-    shapes, bulge, inv_area = shape
-    width = out.shape[1]
-    across = width - 2 * MARGIN
-    stride = 4 * (width + 2 * pad)
-    band[: (y1 - y0) * stride] = 0.0
-    drawn, near, shares = np.empty((4, BAND + 1)), np.empty((BAND, 2), np.int64), np.empty((BAND, 4))
+def interpolation_rows(coarse, width):  # type: ignore[no-untyped-def]
+    """Scratch of `finish_row`: a row of the coarser level, and a row of ``width`` pixels, in which it adds nothing."""
+    return np.empty(4 * coarse.shape[1], np.float32), np.zeros(8 * ((width + 1) >> 1), np.float32)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def finish_row(band, pad, coarse, y, margin, scratch, row):  # type: ignore[no-untyped-def]
+    """Row ``y`` of a level with ``margin`` rows around: its differences, summed, and what the coarser level adds."""
+    line, fine = scratch
+    if coarse.shape[0] > 0:
+        coarser(coarse, y - margin, margin, line, fine)
+    running_sum(band.sums, (y - band.y0) * band.stride, pad, fine, row, (band.stride >> 2) - 2 * pad)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyped-def]
+    """A band of a level above the lowest: ``out (rows + 2*MARGIN, columns + 2*MARGIN, 4)``."""
+    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    sums, stride, y0, y1 = band
+    cells, reach = levels.cells, levels.reach[level]
+    rows, across, start = levels.sizes[level, 0], levels.sizes[level, 1], levels.sizes[level, 2]
+    sums[: (y1 - y0) * stride] = 0.0
+    buffer = psf_buffer(shape, BAND)
     scale = 1.0 / (1 << level)
     in_bank = mirrored if mirrored else len(firsts)
     for j in range(rows):
@@ -89,7 +127,7 @@ def _cell_band(cells, reach, rows, level, bank, shape, coarse, out, band, y0, y1
         r = reach[j] * scale
         if r == 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
-        p = RECORD * j * across
+        p = RECORD * (start + j * across)
         for i in range(across):
             if cells[p] != 0.0 or cells[p + 1] != 0.0 or cells[p + 2] != 0.0 or cells[p + 3] != 0.0:
                 radius = np.rint(bank_steps * cell_radius(cells, p, scale))
@@ -97,32 +135,23 @@ def _cell_band(cells, reach, rows, level, bank, shape, coarse, out, band, y0, y1
                     k = int(radius)
                     if cells[p + 6] < 0.0:
                         k += mirrored
-                    first = y + firsts[k]
-                    begin = max(y0 - first, 0)
-                    stop = min(y1 - first, ends[k + 1] - ends[k])
-                    o = (first + begin - y0) * stride + 4 * (pad + MARGIN + i)
-                    draw_rows(band, o, stride, cells, p, columns, weights, ends[k] + begin, ends[k] + stop)
+                    first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
+                    o = (first - y0) * stride + 4 * (pad + MARGIN + i)
+                    draw_rows(sums, o, stride, cells, p, bank_rows, span)
                 else:
                     coc = math.copysign(radius / bank_steps, cells[p + 6])
-                    _draw_wide(
-                        *(band, stride, pad, width, cells, p, i + MARGIN, y, coc, shapes, bulge, inv_area, y0, y1),
-                        *(drawn, near, shares),
-                    )
+                    _draw_wide(band, pad, cells, p, i + MARGIN, y, coc, buffer)
             p += RECORD
-    line = np.empty(4 * coarse.shape[1], np.float32)
-    fine = np.zeros(8 * ((width + 1) >> 1), np.float32)
+    scratch = interpolation_rows(coarse, out.shape[1])
     for y in range(y0, y1):
-        if coarse.shape[0] > 0:
-            coarser(coarse, y - MARGIN, MARGIN, line, fine)
-        running_sum(band, (y - y0) * stride, pad, fine, out[y].reshape(-1), width)
+        finish_row(band, pad, coarse, y, MARGIN, scratch, out[y].reshape(-1))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _lowest(values, coc, weight, y, channel, constant, levels, shares, bank_steps, in_bank, pixels, energy, radii):  # type: ignore[no-untyped-def]
-    """What row ``y`` has on the lowest level: interleaved ``pixels``, and ``radii`` in steps of the bank.
-
-    -1 stands for a pixel that has nothing there. ``shares`` and ``energy`` are used up.
-    """
+def _lowest(picture, lanes, y, bank_steps, in_bank, row):  # type: ignore[no-untyped-def]
+    """Fill ``row`` from row ``y`` of the picture, once `classify` has filled its levels and shares."""
+    values, coc, weight = picture
+    levels, shares, energy, pixels, radii = row
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(levels)):
         level = levels[x]
@@ -133,46 +162,46 @@ def _lowest(values, coc, weight, y, channel, constant, levels, shares, bank_step
         for x in range(len(weights)):
             shares[x] *= weights[x]
     for k in range(4):
-        lane = pixels[k:]
-        if channel[k] >= 0:
-            plane = values[channel[k], y]
+        lane, channel = pixels[k:], lanes.channel[k]
+        if channel >= 0:
+            plane = values[channel, y]
             for x in range(len(plane)):
                 # What has no share may be anything, NaN as well.
                 value = shares[x] * plane[x] if shares[x] != zero else zero
                 lane[4 * x] = value
                 energy[x] += abs(value)
         else:
-            value = constant[k]
+            value = lanes.constant[k]
             for x in range(len(shares)):
                 lane[4 * x] = shares[x] * value
                 energy[x] += shares[x] * value
     steps, most = np.float32(bank_steps), np.float32(in_bank)
-    row = coc[y]
-    for x in range(len(row)):
-        radius = min(np.rint(steps * abs(row[x])), most)
+    signed = coc[y]
+    for x in range(len(signed)):
+        radius = min(np.rint(steps * abs(signed[x])), most)
         radii[x] = np.int32(-one if energy[x] == zero else radius)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def draw_pixels(  # type: ignore[no-untyped-def]
-    values, coc, weight, channel, constant, merging, highest, bounds, reach, marks, bank, shape, band, y0, y1
-):
-    """Draw the lowest level and the highlights into the rows ``y0 .. y1-1`` of ``band``."""
-    bank_steps, mirrored, pad, firsts, ends, columns, weights, _ = bank
-    shapes, bulge, inv_area = shape
+def draw_pixels(picture, lanes, levels, bank, band):  # type: ignore[no-untyped-def]
+    """Draw the lowest level and the highlights into a band."""
+    values, coc, weight = picture
+    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    sums, stride, y0, y1 = band
     height, width = coc.shape
-    stride = 4 * (width + 2 * pad)
-    band[: (y1 - y0) * stride] = 0.0
-    drawn, near, shares = np.empty((4, BAND + 1)), np.empty((BAND, 2), np.int64), np.empty((BAND, 4))
+    sums[: (y1 - y0) * stride] = 0.0
+    buffer = psf_buffer(shape, BAND)
     in_bank = mirrored if mirrored else len(firsts)
-    levels, rest, radii = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.int32)
-    pixels, energy = np.empty(4 * width, np.float32), np.empty(width, np.float32)
+    kinds, rest, energy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    pixels, radii = np.empty(4 * width, np.float32), np.empty(width, np.int32)
+    row = Row(kinds, rest, energy, pixels, radii)
+    reach = levels.reach[0]
     for y in range(height):
         r = reach[y]
         if r < 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
-        begin, end = classify(values, coc, weight, y, merging, bounds, highest, levels, rest)
-        _lowest(values, coc, weight, y, channel, constant, levels, rest, bank_steps, in_bank, pixels, energy, radii)
+        begin, end = classify(picture, levels.thresholds, y, kinds, rest)
+        _lowest(picture, lanes, y, bank_steps, in_bank, row)
         for x in range(begin, end):
             p = 4 * x
             k = int(radii[x])
@@ -181,77 +210,47 @@ def draw_pixels(  # type: ignore[no-untyped-def]
             if k < in_bank:
                 if coc[y, x] < 0.0:
                     k += mirrored
-                first = y + firsts[k]
-                start = max(y0 - first, 0)
-                stop = min(y1 - first, ends[k + 1] - ends[k])
-                o = (first + start - y0) * stride + 4 * (pad + x)
-                draw_rows(band, o, stride, pixels, p, columns, weights, ends[k] + start, ends[k] + stop)
+                first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
+                draw_rows(sums, (first - y0) * stride + 4 * (pad + x), stride, pixels, p, bank_rows, span)
             else:
-                here = np.float64(coc[y, x])
-                signed = math.copysign(np.rint(bank_steps * abs(here)) / bank_steps, here)
-                _draw_wide(
-                    *(band, stride, pad, width, pixels, p, x, y, signed, shapes, bulge, inv_area, y0, y1),
-                    *(drawn, near, shares),
-                )
-    for mark in marks:
+                _draw_wide(band, pad, pixels, p, x, y, rounded(np.float64(coc[y, x]), bank_steps), buffer)
+    for mark in levels.marks:
         y, x = mark // width, mark % width
-        here = np.float64(coc[y, x])
-        pixels[:4] = constant
-        for lane in range(4):
-            if channel[lane] >= 0:
-                pixels[lane] = values[channel[lane], y, x]
+        for k in range(4):
+            pixels[k] = values[lanes.channel[k], y, x] if lanes.channel[k] >= 0 else lanes.constant[k]
             if weight.shape[0] > 0:
-                pixels[lane] *= weight[y, x]
-        signed = math.copysign(np.rint(bank_steps * abs(here)) / bank_steps, here)
-        _draw_wide(
-            *(band, stride, pad, width, pixels, 0, x, y, signed, shapes, bulge, inv_area, y0, y1),
-            *(drawn, near, shares),
-        )
+                pixels[k] *= weight[y, x]
+        _draw_wide(band, pad, pixels, 0, x, y, rounded(np.float64(coc[y, x]), bank_steps), buffer)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _pixel_band(  # type: ignore[no-untyped-def]
-    values, coc, weight, channel, constant, merging, highest, bounds, reach, marks,
-    bank, shape, coarse, first_out, last, out, band, y0, y1
-):  # fmt: skip
-    """Rows ``y0 .. y1-1`` of the picture ``out``: the lowest level, the highlights, and all that is coarser.
+def _pixel_band(picture, lanes, levels, bank, coarse, last, out, band):  # type: ignore[no-untyped-def]
+    """A band of the picture ``out``: the lowest level, the highlights, and all that is coarser.
 
-    The lanes go to the channels from ``first_out`` on. Where ``last >= 0``, they are divided by lane ``last``.
+    Where ``last >= 0``, the lanes are divided by lane ``last``.
     """
-    draw_pixels(
-        *(values, coc, weight, channel, constant, merging, highest, bounds, reach, marks, bank, shape, band, y0, y1)
-    )
-    pad, width = bank[2], coc.shape[1]
+    draw_pixels(picture, lanes, levels, bank, band)
+    width, first = out.shape[2], lanes.first
     pixels, rest = np.empty(4 * width, np.float32), np.empty(width, np.float32)
-    line = np.empty(4 * coarse.shape[1], np.float32)
-    fine = np.zeros(8 * ((width + 1) >> 1), np.float32)
-    for y in range(y0, y1):
-        if coarse.shape[0] > 0:
-            coarser(coarse, y, 0, line, fine)
-        running_sum(band, 4 * (y - y0) * (width + 2 * pad), pad, fine, pixels, width)
+    scratch = interpolation_rows(coarse, width)
+    for y in range(band.y0, band.y1):
+        finish_row(band, bank.reach, coarse, y, 0, scratch, pixels)
         rest[:] = np.float32(1.0)
         if last >= 0:
-            lanes = pixels[last:]
+            lane = pixels[last:]
             for x in range(width):
-                rest[x] = np.float32(1.0) / max(lanes[4 * x], np.float32(TINY))
-        for number in range(min(4, out.shape[0] - first_out)):
-            plane, lanes = out[first_out + number, y], pixels[number:]
+                rest[x] = np.float32(1.0) / max(lane[4 * x], np.float32(TINY))
+        for number in range(min(4, out.shape[0] - first)):
+            plane, lane = out[first + number, y], pixels[number:]
             if number == last:
                 rest[:] = np.float32(1.0)
             for x in range(width):
-                plane[x] = lanes[4 * x] * rest[x]
+                plane[x] = lane[4 * x] * rest[x]
 
 
-def bank_of(merging: Merging, shape: tuple[np.ndarray, float, float], *, slopes: bool = False) -> Bank:
+def bank_for(profile: Profile, merging: Merging, *, slopes: bool = False) -> RadiusBank:
     """The PSFs of every cell but those that are wider than the levels would have them, or than `WIDEST`."""
-    return psf_bank(min(2.0 * merging.cells * (1 + FADE), WIDEST), STEPS, *shape, slopes=slopes)
-
-
-def planes_of(weight: Tensor | None, batch: int) -> list[np.ndarray]:
-    """The weight ``(H, W)`` of every picture; of no rows where there is none."""
-    if weight is None:
-        return [np.empty((0, 0), np.float32)] * batch
-    return list(weight.detach().contiguous()[:, 0].numpy())
+    return radius_bank(min(2.0 * merging.cells * (1 + FADE), WIDEST), STEPS, shape_of(profile), slopes=slopes)
 
 
 def splat_merged(
@@ -267,48 +266,37 @@ def splat_merged(
     """`torchbokeh.ops.merge.splat_merged` for CPU float32."""
     b, channels, h, w = values.shape
     with stage("bank"):
-        shape = shape_tables(profile)
-        bank = bank_of(merging, shape)
-    source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
-    weights = planes_of(weight, b)
+        bank = bank_for(profile, merging)
     out = torch.empty(b, channels + ones, h, w, dtype=torch.float32)
     groups = -(-(channels + ones) // 4)
     last = channels + ones - 1 if normalise and groups == 1 else -1
     buffers: list[np.ndarray] = []
-    for n in range(b):
+    for picture, target in zip(Picture.each(values, coc, weight), out.numpy(), strict=True):
         for group in range(groups):
-            scene = source[n].numpy(), radii[n, 0], weights[n]
             lanes = Lanes.of(group, channels, ones)
-            levels = collect(*scene, lanes, merging, highest)
-            coarse = coarse_picture(levels, bank, shape, buffers)
-            kernel = partial(
-                _pixel_band,
-                *(*scene, *lanes, merging, highest, levels.bounds, levels.reach[0]),
-                *(levels.marks, bank, shape, coarse, 4 * group, last, out[n].numpy()),
-            )
+            levels = collect(picture, lanes, merging, highest)
+            coarse = coarse_picture(levels, bank, buffers)
+            kernel = partial(_pixel_band, picture, lanes, levels, bank, coarse, last, target)
             run_all(buffered(kernel, w + 2 * bank.reach, buffers), bands(h), "picture")
     if normalise and groups > 1:
         out[:, :-1] /= out[:, -1:].clamp_min(TINY)
     return out
 
 
-def coarse_picture(
-    levels: Levels, bank: Bank, shape: tuple[np.ndarray, float, float], buffers: list[np.ndarray]
-) -> np.ndarray:
+def coarse_picture(levels: Levels, bank: RadiusBank, buffers: list[np.ndarray]) -> np.ndarray:
     """The picture ``(h + 2 MARGIN, w + 2 MARGIN, 4)`` of level 1 and all above it; of no rows if there are none."""
     coarse = np.empty((0, 0, 4), np.float32)
-    for level in range(len(levels.sizes) - 1, 0, -1):
-        rows, across, first = levels.sizes[level]
+    for level in range(levels.thresholds.highest, 0, -1):
+        rows, across, _ = levels.sizes[level]
         fine = np.empty((rows + 2 * MARGIN, across + 2 * MARGIN, 4), np.float32)
-        cells, reach = levels.cells[RECORD * first :], levels.reach[level]
-        kernel = partial(_cell_band, cells, reach, rows, level, bank, shape, coarse, fine)
+        kernel = partial(_cell_band, levels, level, bank, coarse, fine)
         run_all(buffered(kernel, fine.shape[1] + 2 * bank.reach, buffers), bands(len(fine)), "levels")
         coarse = fine
     return coarse
 
 
-def buffered(kernel: Callable[..., None], columns: int, free: list[np.ndarray]) -> Callable[[int, int], None]:
-    """Call ``kernel(buffer, y0, y1)`` with a buffer for a band that no other thread has.
+def buffered(kernel: Callable[[Band], None], columns: int, free: list[np.ndarray]) -> Callable[[int, int], None]:
+    """Call ``kernel(band)`` for the rows ``y0 .. y1-1`` with a buffer that no other thread has.
 
     The buffers are used again: a fresh one for every band would cost more than what is drawn into it.
     """
@@ -318,7 +306,7 @@ def buffered(kernel: Callable[..., None], columns: int, free: list[np.ndarray]) 
         buffer = free.pop() if free else np.empty(0, np.float64)
         if len(buffer) < size:
             buffer = np.empty(size, np.float64)
-        kernel(buffer, y0, y1)
+        kernel(Band(buffer, 4 * columns, y0, y1))
         free.append(buffer)
 
     return work

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numba as nb
 import numpy as np
+from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.merge import FADE, LEAST_CONTRAST, Merging
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
 """Rows of a piece of work: 64 rows of 1024 columns in double fill the second-level cache of common processors."""
@@ -17,9 +18,30 @@ RECORD = 8
 """Floats of a cell: four channels, then the sums of share, of share times radius and of share times signed CoC."""
 
 
-class Lanes(NamedTuple):
-    """Which channels a pass of four takes: their numbers, and where there is none, the constant in its place."""
+class Picture(NamedTuple):
+    """A picture of a batch, or the gradients of one: ``values (C, H, W)``; ``coc (H, W)``, the signed radius in px;
+    and ``weight (H, W)``, factor of the values, of no rows where there is none.
+    """
 
+    values: np.ndarray
+    coc: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def each(cls, values: Tensor, coc: Tensor, weight: Tensor | None) -> "list[Picture]":
+        """The pictures of a batch, float32: ``(B, C, H, W)``, ``(B, 1, H, W)`` and ``(B, 1, H, W)``."""
+        if weight is None:
+            weight = coc.new_empty(len(coc), 1, 0, 0)
+        arrays = (t.detach().contiguous().numpy() for t in (values, coc, weight))
+        return [cls(v, r[0], w[0]) for v, r, w in zip(*arrays, strict=True)]
+
+
+class Lanes(NamedTuple):
+    """Which channels a pass of four takes, from the ``first`` on: their numbers ``channel (4,)``, or -1 where there is
+    none and the ``constant (4,)`` is taken in its place.
+    """
+
+    first: int
     channel: np.ndarray
     constant: np.ndarray
 
@@ -28,25 +50,33 @@ class Lanes(NamedTuple):
         """The lanes of a group of four of ``channels`` channels, and one more of ones."""
         wanted = np.arange(4 * group, 4 * group + 4)
         constant = ((wanted == channels) & ones).astype(np.float32)
-        return cls(np.where(wanted < channels, wanted, -1), constant)
+        return cls(4 * group, np.where(wanted < channels, wanted, -1), constant)
+
+
+class Thresholds(NamedTuple):
+    """What the level of a pixel depends on: highlights are bright against the ``means (C,)`` of the channels."""
+
+    merging: Merging
+    highest: int
+    means: np.ndarray
 
 
 class Levels(NamedTuple):
     """What stands where.
 
     Attributes:
+        thresholds: what decided on it.
         sizes: ``(L+1, 3)``: rows and columns of each level, and the number of its first cell.
         cells: flat records of all cells, see `RECORD`.
         reach: ``(L+1, H)`` largest radius in px in each row of a level; on the lowest, of what is no highlight.
         marks: flat indices of the highlights.
-        bounds: ``(C,)`` mean of each channel, against which highlights are bright.
     """
 
+    thresholds: Thresholds
     sizes: np.ndarray
     cells: np.ndarray
     reach: np.ndarray
     marks: np.ndarray
-    bounds: np.ndarray
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -58,13 +88,15 @@ def _largest(row):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def classify(values, coc, weight, y, merging, bounds, highest, level, share):  # type: ignore[no-untyped-def]
+def classify(picture, thresholds, y, level, share):  # type: ignore[no-untyped-def]
     """Level of every pixel of row ``y`` and its share there; the rest belongs to the level below.
 
     -1 stands for a highlight, -2 for a pixel without weight. ``level`` and ``share`` are float32 rows, so that the
     compiler can work on many pixels at a time. Returns the columns between which pixels have weight.
     """
-    finest, highlight = np.float32(merging[0]), np.float32(merging[1])
+    values, coc, weight = picture
+    merging, highest, means = thresholds
+    finest, highlight = np.float32(merging.cells), np.float32(merging.highlight)
     one, zero, least = np.float32(1.0), np.float32(0.0), np.float32(LEAST_CONTRAST)
     row = coc[y]
     top = _largest(row)
@@ -91,48 +123,49 @@ def classify(values, coc, weight, y, merging, bounds, highest, level, share):  #
             level[x] = here if (r >= threshold) & (level[x] >= zero) else level[x]
             share[x] = min((r - threshold) * scale, one) if r >= threshold else share[x]
     for k in range(values.shape[0]):
-        plane, bound = values[k, y], bounds[k]
+        plane, mean = values[k, y], means[k]
         for x in range(len(row)):
-            high = (level[x] > zero) & (abs(plane[x]) > bound * max(highlight * row[x] * row[x], least))
+            high = (level[x] > zero) & (abs(plane[x]) > mean * max(highlight * row[x] * row[x], least))
             level[x] = -one if high else level[x]
     return begin, end
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _add(cells, p, a, b, c, d, w, r, signed):  # type: ignore[no-untyped-def]
+def _add(cells, p, lanes, w, r, signed):  # type: ignore[no-untyped-def]
     """Add to the record at ``p``."""
-    cells[p] += a
-    cells[p + 1] += b
-    cells[p + 2] += c
-    cells[p + 3] += d
+    for k in range(4):
+        cells[p + k] += lanes[k]
     cells[p + 4] += w
     cells[p + 5] += r
     cells[p + 6] += signed
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cells, reach, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
+def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
     """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
 
-    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
+    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are. One long
+    function: sums are kept in registers as long as neighbours go to the same cell.
     """
-    width = coc.shape[1]
-    highest = sizes.shape[0] - 1
+    values, coc, weight = picture
+    thresholds, sizes, cells, reach, _ = levels
+    highest, width = thresholds.highest, coc.shape[1]
     for level in range(1, highest + 1):
         columns, start = sizes[level, 1], sizes[level, 2]
         first, last = y0 >> level, (y1 - 1) >> level
         cells[RECORD * (start + first * columns) : RECORD * (start + (last + 1) * columns)] = 0.0
         reach[level, first : last + 1] = 0.0
+    channel, constant = lanes.channel, lanes.constant
     c0, c1, c2, c3 = channel[0], channel[1], channel[2], channel[3]
-    zero, one = np.float32(0.0), np.float32(1.0)
     a, b, c, d = constant[0], constant[1], constant[2], constant[3]
+    zero, one = np.float32(0.0), np.float32(1.0)
     weighted = weight.shape[0] > 0
-    levels, shares = np.empty(width, np.float32), np.empty(width, np.float32)
+    numbers, shares = np.empty(width, np.float32), np.empty(width, np.float32)
     farthest = np.zeros(highest + 1, np.float32)
     starts = np.empty(highest + 1, np.int64)
     for y in range(y0, y1):
         count = 0
-        begin, end = classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
+        begin, end = classify(picture, thresholds, y, numbers, shares)
         for level in range(1, highest + 1):
             starts[level] = sizes[level, 2] + (y >> level) * sizes[level, 1]
         farthest[:] = 0.0
@@ -141,7 +174,7 @@ def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cel
         current = -1
         s0 = s1 = s2 = s3 = sw = sr = ss = zero
         for x in range(begin, end):
-            level = int(levels[x])
+            level = int(numbers[x])
             signed = coc[y, x]
             r = abs(signed)
             if level <= 0:
@@ -162,7 +195,7 @@ def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cel
             p = RECORD * (starts[level] + (x >> level))
             if p != current:
                 if current >= 0:
-                    _add(cells, current, s0, s1, s2, s3, sw, sr, ss)
+                    _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
                 current = p
                 s0 = s1 = s2 = s3 = sw = sr = ss = zero
             whole = weight[y, x] if weighted else one
@@ -181,9 +214,9 @@ def _collect(values, coc, weight, channel, constant, merging, bounds, sizes, cel
                 if level > 0:
                     w = whole - w
                     p = RECORD * (starts[level] + (x >> level))
-                    _add(cells, p, w * a, w * b, w * c, w * d, w, w * r, w * signed)
+                    _add(cells, p, (w * a, w * b, w * c, w * d), w, w * r, w * signed)
         if current >= 0:
-            _add(cells, current, s0, s1, s2, s3, sw, sr, ss)
+            _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
         counts[y] = count
         reach[0, y] = farthest[0]
         for level in range(1, highest + 1):
@@ -216,7 +249,7 @@ def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
         sums[y, channels] = count
 
 
-def usual(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def channel_means(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Mean magnitude ``(C,)`` of every channel, over the pixels that hold anything: highlights are far above it."""
     sums = np.empty((values.shape[1], len(values) + 1))
     run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
@@ -224,12 +257,10 @@ def usual(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return (np.array(totals) / max(count, TINY)).astype(np.float32)
 
 
-def collect(
-    values: np.ndarray, coc: np.ndarray, weight: np.ndarray, lanes: Lanes, merging: Merging, highest: int
-) -> Levels:
-    """Sum ``values (C, H, W)`` with ``coc (H, W)`` and ``weight`` (of no rows: all 1) into the cells of all levels."""
-    height, width = coc.shape
-    bounds = usual(values, weight)
+def collect(picture: Picture, lanes: Lanes, merging: Merging, highest: int) -> Levels:
+    """Sum a picture into the cells of all levels."""
+    height, width = picture.coc.shape
+    thresholds = Thresholds(merging, highest, channel_means(picture.values, picture.weight))
     sizes = np.zeros((highest + 1, 3), np.int64)
     count = 0
     for level in range(1, highest + 1):
@@ -238,14 +269,13 @@ def collect(
     cells = np.empty(RECORD * count, np.float32)
     reach = np.empty((highest + 1, height), np.float64)
     marks, counts = np.empty((height, width), np.int64), np.empty(height, np.int64)
-    work = partial(_collect, values, coc, weight, *lanes, merging, bounds, sizes, cells, reach, marks, counts)
-    tile = max(1 << highest, BAND // 2)  # no cell lies in two tiles
-    run_all(work, [(y, min(y + tile, height)) for y in range(0, height, tile)], "collect")
+    levels = Levels(thresholds, sizes, cells, reach, np.empty(0, np.int64))
+    work = partial(_collect, picture, lanes, levels, marks, counts)
+    run_all(work, row_bands(height, max(1 << highest, BAND // 2)), "collect")  # no cell lies in two of them
     found = [marks[y, : counts[y]] for y in np.flatnonzero(counts)]
-    return Levels(sizes, cells, reach, np.concatenate([np.empty(0, np.int64), *found]), bounds)
+    return levels._replace(marks=np.concatenate([levels.marks, *found]))
 
 
 def bands(height: int) -> list[tuple[int, int]]:
     """Pieces of work that together make up ``height`` rows; low pictures come in eight or so, for all threads."""
-    rows = min(max(-(-height // 8), 16), BAND)
-    return [(y, min(y + rows, height)) for y in range(0, height, rows)]
+    return row_bands(height, min(max(-(-height // 8), 16), BAND))

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge import bank_of, cell_radius, planes_of
-from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, bands, classify, collect
-from torchbokeh.ops.kernels.psf_bank import Bank, draw_psf, draw_slopes
+from torchbokeh.ops.kernels.merge import bank_for, cell_radius
+from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, bands, classify, collect
+from torchbokeh.ops.kernels.radius_bank import RadiusBank, draw_psf, draw_slopes, psf_buffer, rounded, rows_within
 from torchbokeh.ops.kernels.rows import gather_rows
-from torchbokeh.ops.kernels.splat import shape_tables
+from torchbokeh.ops.kernels.splat import clamped, row_range
 from torchbokeh.ops.merge import MARGIN, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.system.threads import run_all
@@ -103,34 +103,35 @@ def _down(fine, margin, coarse, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_wide(sums, height, width, pad, x, y, coc, shape, found):  # type: ignore[no-untyped-def]
+def _gather_wide(sums, pad, x, y, coc, buffer, found):  # type: ignore[no-untyped-def]
     """`gather_rows` for a PSF that is not in the bank, centred on the cell ``(x, y)``."""
-    shapes, bulge, inv_area = shape
-    s = 1 if coc < 0.0 else 0
-    r = max(abs(coc), MIN_RADIUS)
-    first = max(-y, math.ceil(max(r * shapes[s, 0, 0] - 0.5, -1e9)))
-    n = max(min(height - 1 - y, math.floor(min(r * shapes[s, -1, 0] + 0.5, 1e9))) - first + 1, 0)
-    border = np.float64(width)
-    rows, moves = np.empty((4, n + 1), np.float64), np.empty((3, n), np.float64)
-    columns, weights, slopes = np.empty((n, 2), np.int64), np.empty((n, 4), np.float64), np.empty((n, 4), np.float64)
-    draw_psf(r, x + 0.5, first, n, 0.0, border, shapes, s, bulge, inv_area, rows, columns, weights)
-    draw_slopes(r, x + 0.5, first, n, 0.0, border, shapes, s, bulge, inv_area, rows, moves, slopes)
-    stride = 4 * (width + 2 * pad)
-    gather_rows(sums, (y + first) * stride + 4 * pad, stride, columns, weights, slopes, 0, n, found)
+    shapes, c = buffer.shape.tables, clamped(coc)
+    s = 1 if c < 0.0 else 0
+    first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], 0, sums.shape[0])
+    n, borders = max(n, 0), (0.0, np.float64(sums.shape[1] - 2 * pad))
+    draw_psf(c, x + 0.5, first, n, borders, buffer)
+    draw_slopes(c, x + 0.5, first, n, borders, buffer)
+    stride = 4 * sums.shape[1]
+    gather_rows(sums, (y + first) * stride + 4 * pad, stride, buffer.rows, (0, n), found)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads, y0, y1):  # type: ignore[no-untyped-def]
-    """Gradients of the cells of rows ``y0 .. y1-1``: of the lanes, and of each unit of share times radius (px)."""
-    bank_steps, mirrored, pad, firsts, ends, columns, weights, slopes = bank
+def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-untyped-def]
+    """Gradients of the cells of rows ``y0 .. y1-1``: of the lanes, and of each unit of share times radius (px).
+
+    ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the level.
+    """
+    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    cells, across, start = levels.cells, levels.sizes[level, 1], levels.sizes[level, 2]
     in_bank = mirrored if mirrored else len(firsts)
-    stride = 4 * (width + 2 * pad)
+    height, stride = sums.shape[0], 4 * sums.shape[1]
+    buffer = psf_buffer(shape, height)
     scale = 1.0 / (1 << level)
     found = np.empty(8, np.float64)
     for j in range(y0, y1):
         y = j + MARGIN
         for i in range(across):
-            p = RECORD * (j * across + i)
+            p = RECORD * (start + j * across + i)
             if cells[p + 4] == 0.0:
                 continue
             smaller = cell_radius(cells, p, scale)
@@ -139,14 +140,11 @@ def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads,
                 k = int(radius)
                 if cells[p + 6] < 0.0:
                     k += mirrored
-                first = y + firsts[k]
-                begin = max(-first, 0)
-                stop = min(height - first, ends[k + 1] - ends[k])
-                o = (first + begin) * stride + 4 * (pad + MARGIN + i)
-                gather_rows(sums, o, stride, columns, weights, slopes, ends[k] + begin, ends[k] + stop, found)
+                first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
+                gather_rows(sums, first * stride + 4 * (pad + MARGIN + i), stride, bank_rows, span, found)
             else:
                 coc = math.copysign(radius / bank_steps, cells[p + 6])
-                _gather_wide(sums, height, width, pad, i + MARGIN, y, coc, shape, found)
+                _gather_wide(sums, pad, i + MARGIN, y, coc, buffer, found)
             slope = 0.0
             for k in range(4):
                 grads[p + k] = found[k]
@@ -156,23 +154,28 @@ def _gather_cells(cells, across, level, sums, height, width, bank, shape, grads,
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_pixels(  # type: ignore[no-untyped-def]
-    values, coc, weight, channel, constant, merging, bounds, sizes, sums, bank, shape, grads,
-    grad_values, grad_coc, grad_weight, y0, y1
-):  # fmt: skip
-    """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells."""
-    bank_steps, mirrored, pad, firsts, ends, columns, weights, slopes = bank
+def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: ignore[no-untyped-def]
+    """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells.
+
+    ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the lowest level, and the cells of ``levels``
+    hold their own gradients. One long function: numba counts references to arrays that are handed on for each pixel.
+    """
+    values, coc, weight = picture
+    grad_values, grad_coc, grad_weight = grads
+    channel, constant = lanes.channel, lanes.constant
+    thresholds, sizes, cells = levels.thresholds, levels.sizes, levels.cells
+    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
     in_bank = mirrored if mirrored else len(firsts)
     height, width = coc.shape
-    stride = 4 * (width + 2 * pad)
-    highest = sizes.shape[0] - 1
-    levels, shares = np.empty(width, np.float32), np.empty(width, np.float32)
+    stride = 4 * sums.shape[1]
+    buffer = psf_buffer(shape, height)
+    numbers, shares = np.empty(width, np.float32), np.empty(width, np.float32)
     found = np.empty(8, np.float64)
     grad = np.empty(5, np.float64)
     for y in range(y0, y1):
-        classify(values, coc, weight, y, merging, bounds, highest, levels, shares)
+        classify(picture, thresholds, y, numbers, shares)
         for x in range(width):
-            level, share = int(levels[x]), shares[x]
+            level, share = int(numbers[x]), shares[x]
             signed = np.float64(coc[y, x])
             whole = weight[y, x] if weight.shape[0] > 0 else np.float32(1.0)
             grad[:] = 0.0
@@ -188,22 +191,18 @@ def _gather_pixels(  # type: ignore[no-untyped-def]
                     if here > 0 and w > 0.0:
                         p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
                         for k in range(4):
-                            grad[k] += w * grads[p + k]
-                        grad[4] += w * whole * grads[p + 4]
+                            grad[k] += w * cells[p + k]
+                        grad[4] += w * whole * cells[p + 4]
             if lowest > 0.0:
                 radius = np.rint(bank_steps * abs(signed))
                 if radius < in_bank:
                     k = int(radius)
                     if signed < 0.0:
                         k += mirrored
-                    first = y + firsts[k]
-                    begin = max(-first, 0)
-                    stop = min(height - first, ends[k + 1] - ends[k])
-                    o = (first + begin) * stride + 4 * (pad + x)
-                    gather_rows(sums, o, stride, columns, weights, slopes, ends[k] + begin, ends[k] + stop, found)
+                    first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
+                    gather_rows(sums, first * stride + 4 * (pad + x), stride, bank_rows, span, found)
                 else:
-                    coc_here = math.copysign(radius / bank_steps, signed)
-                    _gather_wide(sums, height, width, pad, x, y, coc_here, shape, found)
+                    _gather_wide(sums, pad, x, y, rounded(signed, bank_steps), buffer, found)
                 moves = radius > bank_steps * MIN_RADIUS
                 for k in range(4):
                     grad[k] += lowest * found[k]
@@ -233,38 +232,32 @@ def gather_merged(
     profile: Profile,
     merging: Merging,
     highest: int,
-    ones: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of ``values``, ``coc`` and ``weight`` (empty without one).
 
     ``out`` is what the forward pass gave if it was normalised.
     """
     b, channels, h, w = values.shape
-    shape = shape_tables(profile)
-    bank = bank_of(merging, shape, slopes=True)
-    source, radii = values.detach().contiguous(), coc.detach().contiguous().numpy()
-    weights = planes_of(weight, b)
-    grad_values, grad_coc = torch.empty_like(source), torch.empty(b, 1, h, w, dtype=torch.float32)
-    grad_weight = torch.empty(b, *weights[0].shape, dtype=torch.float32)
-    grad_np = grad.contiguous().numpy()
+    ones = grad.shape[1] > channels
+    bank = bank_for(profile, merging, slopes=True)
+    size = (0, 0) if weight is None else (h, w)
+    results = [torch.empty(b, *rest, dtype=torch.float32) for rest in ((channels, h, w), (1, h, w), (1, *size))]
+    pictures, grads = Picture.each(values, coc, weight), Picture.each(*results)
+    arriving = grad.contiguous().numpy()
     divided = np.empty((b, 0, h, w), np.float32) if out is None else out.contiguous().numpy()
-    for n in range(b):
-        for group in range(-(-(channels + ones) // 4)):
-            scene = source[n].numpy(), radii[n, 0], weights[n]
+    for n, picture in enumerate(pictures):
+        for group in range(-(-grad.shape[1] // 4)):
             lanes = Lanes.of(group, channels, ones)
-            levels = collect(*scene, lanes, merging, highest)
+            levels = collect(picture, lanes, merging, highest)
             incoming = np.empty((h, w, 4), np.float32)
-            interleave = partial(_interleave, grad_np[n], divided[n], 4 * group, incoming)
+            interleave = partial(_interleave, arriving[n], divided[n], lanes.first, incoming)
             run_all(interleave, bands(h), "gradient of the picture")
-            grads = _gather_levels(levels, incoming, bank, shape)
-            sums = _summed(incoming, bank.reach).reshape(-1)
-            kernel = partial(
-                _gather_pixels,
-                *(*scene, *lanes, merging, levels.bounds, levels.sizes, sums, bank, shape),
-                *(grads, grad_values[n].numpy(), grad_coc[n, 0].numpy(), grad_weight[n].numpy()),
-            )
+            cells = _gather_levels(levels, incoming, bank)
+            sums = _summed(incoming, bank.reach)
+            kernel = partial(_gather_pixels, picture, lanes, levels._replace(cells=cells), sums, bank, grads[n])
             run_all(kernel, bands(h), "gather pixels")
-    return grad_values, grad_coc, grad_weight[:, None]
+    by_values, by_coc, by_weight = results
+    return by_values, by_coc, by_weight
 
 
 def _summed(lanes: np.ndarray, pad: int) -> np.ndarray:
@@ -274,18 +267,15 @@ def _summed(lanes: np.ndarray, pad: int) -> np.ndarray:
     return sums
 
 
-def _gather_levels(levels: Levels, fine: np.ndarray, bank: Bank, shape: tuple[np.ndarray, float, float]) -> np.ndarray:
+def _gather_levels(levels: Levels, fine: np.ndarray, bank: RadiusBank) -> np.ndarray:
     """Gradients of all cells, in records like theirs, from the gradient ``fine (H, W, 4)`` of the picture."""
     grads = np.empty_like(levels.cells)
     margin = 0
-    for level in range(1, len(levels.sizes)):
-        rows, across, first = levels.sizes[level]
+    for level in range(1, levels.thresholds.highest + 1):
+        rows, across, _ = levels.sizes[level]
         coarse = np.empty((rows + 2 * MARGIN, across + 2 * MARGIN, 4), np.float32)
         run_all(partial(_down, fine, margin, coarse), bands(len(coarse)), "levels")
-        sums = _summed(coarse, bank.reach).reshape(-1)
-        here = slice(RECORD * first, RECORD * (first + rows * across))
-        size = coarse.shape[:2]
-        kernel = partial(_gather_cells, levels.cells[here], across, level, sums, *size, bank, shape, grads[here])
-        run_all(kernel, bands(rows), "gather cells")
+        sums = _summed(coarse, bank.reach)
+        run_all(partial(_gather_cells, levels, level, sums, bank, grads), bands(rows), "gather cells")
         fine, margin = coarse, MARGIN
     return grads

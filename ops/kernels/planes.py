@@ -6,6 +6,8 @@ are independent and do not depend on the number of threads.
 """
 
 import math
+from functools import partial
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -13,13 +15,40 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.planes import SOLID, Plates
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 MEMORY = 1 << 26
 """Bytes of copies that each thread keeps."""
 
 BAND = 16
 """Rows of a band: small enough that bands keep all threads busy, large enough that a view's tables are reused."""
+
+
+class Textures(NamedTuple):
+    """The textures of K rectangles: their ``texels``, flat, each level with a rim of one texel; the ``first (K, L)`` of
+    each level, and its ``sizes (K, L, 2)``, width and height; the ``full (K, 2)`` sizes of level 0; and the flags
+    ``(K,)`` of `Plates`.
+    """
+
+    texels: np.ndarray
+    first: np.ndarray
+    sizes: np.ndarray
+    full: np.ndarray
+    mirror: np.ndarray
+    infinite: np.ndarray
+
+
+class Views(NamedTuple):
+    """V views: ``inverse (V, K, 3, 3)`` and ``level (V, K)`` as in `torchbokeh.ops.planes.render_planes`, the
+    rectangles in ``order (V, K)`` of depth, roughly; and of the copies that views share the numbers ``copy (V, K)``,
+    -1 for none, and the ``columns (N, 2)``, the first and how many.
+    """
+
+    inverse: np.ndarray
+    level: np.ndarray
+    order: np.ndarray
+    copy: np.ndarray
+    columns: np.ndarray
 
 
 # Only functions of numbers are inlined: numba counts references to arrays at each inlined call, with atomic
@@ -62,10 +91,13 @@ def _sort(active, count, depths):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _render_band(  # type: ignore[no-untyped-def]
-    texels, first, sizes, full, mirror, infinite, inverse, level, order, copy, columns, y0, y1, each, out, nearest
-):
-    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``."""
+def _render_band(textures, shown, each, out, nearest, y0, y1):  # type: ignore[no-untyped-def]
+    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``.
+
+    One long function: to hand arrays on within its loops would take longer than the work itself, see above.
+    """
+    texels, first, sizes, full, mirror, infinite = textures
+    inverse, level, order, copy, columns = shown
     views, count = level.shape
     width = out.shape[2]
     begin = np.empty(count, np.int64)
@@ -233,12 +265,10 @@ def render_planes(
     copy, columns = _copies(plates, sizes, homographies, level, size, parents)
     out = torch.zeros(views if frames else 1, *size, 4, dtype=torch.float32 if frames else torch.float64)
     nearest = torch.zeros(views if frames else 0, *size)
-    tables = (texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite), homographies)
-
-    def work(y0: int, y1: int) -> None:
-        _render_band(*tables, level.numpy(), order, copy, columns, y0, y1, frames, out.numpy(), nearest.numpy())
-
-    run_all(work, [(y, min(y + BAND, size[0])) for y in range(0, size[0], BAND)])
+    textures = Textures(texels, first, sizes, full, np.array(plates.mirror), np.array(plates.infinite))
+    shown = Views(homographies, level.numpy(), order, copy, columns)
+    work = partial(_render_band, textures, shown, frames, out.numpy(), nearest.numpy())
+    run_all(work, row_bands(size[0], BAND))
     mean = out if frames else out / max(views, 1)
     return mean.permute(0, 3, 1, 2).float().contiguous(), nearest[:, None] if frames else nearest.new_zeros(0)
 

@@ -5,19 +5,48 @@ decision at every silhouette. Pixels do not depend on each other: the result has
 """
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.kernels.interleave import add_one, interleave
+from torchbokeh.ops.kernels.interleave import add_one, interleave, separate
 from torchbokeh.ops.nbuffers import NBuffers
 from torchbokeh.ops.raycast import window
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 16
 """Rows of a band: few enough that threads which meet long rays are not the last to finish."""
+
+
+class Frame(NamedTuple):
+    """A picture that is looked at from elsewhere: ``colour``, and ``missed``, what rays see that hit nothing, both
+    flat, four to a pixel; ``cocs (1 or S, H*W)``, one field for all views or one for each, cut at the limit of
+    `_add_view`; the ``bounds (2, H, W)`` of the CoC that rays can meet; and settings of
+    `torchbokeh.ops.raycast.subsample_blur`.
+    """
+
+    colour: np.ndarray
+    missed: np.ndarray
+    cocs: np.ndarray
+    bounds: np.ndarray
+    far: float
+    tolerance: float
+
+
+class Rays(NamedTuple):
+    """Where the rays of views ``(S, 2)`` are after j steps, for all j that the bounds of the image allow.
+
+    From the ``first (S,)`` j on, ``steps (S, K, 2)`` leads to a pixel, relative to the output pixel, and the ray is the
+    ``shares (S, K)`` away from it, towards the next one.
+    """
+
+    views: np.ndarray
+    first: np.ndarray
+    steps: np.ndarray
+    shares: np.ndarray
 
 
 @nb.njit(inline="always")
@@ -73,16 +102,18 @@ def _bounds_band(low, high, extent, reach, iterations, y0, y1, bounds):  # type:
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _add_view(total, colour, missed, coc, low, high, view, first_step, steps, shares, far, tolerance, y):  # type: ignore[no-untyped-def]
-    """Add to ``total (W*4)`` what one view sees in row y, less the frame.
+def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
+    """Add to ``total (W*4)`` what view ``s`` sees in row y, less the frame.
 
-    ``colour`` and ``missed`` are flat, four to a pixel, ``coc`` is flat, ``low`` and ``high`` are the bounds in this
-    row, ``steps`` and ``shares`` come from `_steps`. One long function: numba counts references to arrays that are
-    handed on within loops, which took two thirds of the time.
+    One long function: numba counts references to arrays that are handed on within loops, which took two thirds of the
+    time.
     """
+    colour, missed, cocs, bounds, far, tolerance = frame
+    coc, low, high = cocs[min(s, len(cocs) - 1)], bounds[0, y], bounds[1, y]
+    first_step, steps, shares = rays.first[s], rays.steps[s], rays.shares[s]
     w = len(low)
     h = len(coc) // w
-    ux, uy = view
+    ux, uy = rays.views[s, 0], rays.views[s, 1]
     along_x = abs(ux) >= abs(uy)
     scale, length = (abs(ux), w) if along_x else (abs(uy), h)
     px, limit, step = 1.0 / scale, length / scale, tolerance / scale
@@ -155,34 +186,24 @@ def _add_view(total, colour, missed, coc, low, high, view, first_step, steps, sh
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _blur_band(colour, missed, cocs, bounds, views, first_steps, steps, shares, far, tolerance, y0, y1, out):  # type: ignore[no-untyped-def]
-    """The mean of all views for rows ``y0 .. y1-1``; ``colour``, ``missed`` and ``out`` are flat, four to a pixel.
-
-    ``cocs (1 or S, H*W)`` is one field for all views, or one for each, cut at the limit of `_add_view`.
-    """
-    w = bounds.shape[2]
+def _blur_band(frame, rays, y0, y1, out):  # type: ignore[no-untyped-def]
+    """The mean of all views for rows ``y0 .. y1-1``; ``out`` is flat, four to a pixel."""
+    colour, views = frame.colour, rays.views
+    w = frame.bounds.shape[2]
     count = len(views)
     total = np.empty(4 * w, np.float64)
     for y in range(y0, y1):
         total[:] = 0.0
         for s in range(count):
-            view = views[s, 0], views[s, 1]
-            if view[0] != 0.0 or view[1] != 0.0:
-                _add_view(
-                    *(total, colour, missed, cocs[min(s, len(cocs) - 1)], bounds[0, y], bounds[1, y], view),
-                    *(first_steps[s], steps[s], shares[s], far, tolerance, y),
-                )
+            if views[s, 0] != 0.0 or views[s, 1] != 0.0:
+                _add_view(total, frame, rays, s, y)
         row = 4 * y * w
         for n in range(4 * w):
             out[row + n] = colour[row + n] + total[n] / (count + 1)
 
 
-def _steps(views: np.ndarray, least: float, most: float, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
-    """Where the rays of each view are after j steps, for all j that the bounds of the image allow.
-
-    Returns the first j ``(S,)``, then for each j the pixel ``(S, K, 2)``, relative to the output pixel, and how far
-    ``(S, K)`` the ray is from it towards the next one.
-    """
+def _rays(views: np.ndarray, least: float, most: float, size: tuple[int, int]) -> Rays:
+    """The rays of views ``(S, 2)`` in a picture of ``(H, W)`` whose CoC lies between ``least`` and ``most``."""
     ranges, positions = [], []
     for ux, uy in views.tolist():
         along_x = abs(ux) >= abs(uy)
@@ -201,7 +222,8 @@ def _steps(views: np.ndarray, least: float, most: float, size: tuple[int, int]) 
         positions.append(np.stack([ahead, whole, aside - whole] if along_x else [whole, ahead, aside - whole], 1))
     length = max(map(len, ranges))
     steps = np.stack([np.pad(p, ((0, length - len(p)), (0, 0))) for p in positions])
-    return np.array([j[0] for j in ranges], np.int64), steps[..., :2].astype(np.int64), steps[..., 2].copy()
+    first = np.array([j[0] for j in ranges], np.int64)
+    return Rays(views, first, steps[..., :2].astype(np.int64), steps[..., 2].copy())
 
 
 def subsample_blur(
@@ -228,7 +250,7 @@ def subsample_blur(
         extent = ranges[0][n], ranges[1][n]
         _bounds_band(low[:, n], high[:, n], extent, reach, iterations, y0, y1, bounds[n])
 
-    bands = [(y, min(y + BAND, h)) for y in range(0, h, BAND)]
+    bands = row_bands(h, BAND)
     run_all(find_bounds, [(n, *band) for n in range(b) for band in bands])
 
     groups = -(-c // 4)
@@ -238,13 +260,14 @@ def subsample_blur(
     limits = np.array([(w if abs(x) >= abs(y) else h) / max(abs(x), abs(y), 1e-300) for x, y in views])
     if max(abs(least), abs(most)) > limits.min():
         field = np.clip(field, -limits[:, None], limits[:, None]).astype(np.float64)
-    steps = _steps(points, least, most, (h, w))
+    rays = _rays(points, least, most, (h, w))
     out = torch.empty(b * groups, h, w, 4)
     result = out.numpy().reshape(b * groups, -1)
 
     def blur(k: int, y0: int, y1: int) -> None:
         n = k // groups
-        _blur_band(source[k], missed[k], field[n], bounds[n], points, *steps, far, tolerance, y0, y1, result[k])
+        frame = Frame(source[k], missed[k], field[n], bounds[n], far, tolerance)
+        _blur_band(frame, rays, y0, y1, result[k])
 
     run_all(blur, [(k, *band) for k in range(b * groups) for band in bands])
-    return out.reshape(b, groups, h, w, 4).permute(0, 1, 4, 2, 3).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
+    return separate(out, c)

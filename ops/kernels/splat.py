@@ -7,18 +7,38 @@ the same order: the result has the same bits for every thread count.
 """
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.kernels.interleave import add_pair, interleave
+from torchbokeh.ops.kernels.interleave import add_pair, interleave, separate
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, area, knot_integrals
-from torchbokeh.ops.system.threads import run_all
+from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
 """Rows of a band: 64 rows of 1024 interleaved double pixels fill the second-level cache of common processors."""
+
+
+class Shape(NamedTuple):
+    """The unit shape of a `Profile`: ``inverse_area`` is 1 / area.
+
+    ``tables (2, K, 7)`` has for each knot of the upright and of the point-mirrored shape: y, left, right, integral of
+    left, integral of right, slope of left and right.
+    """
+
+    tables: np.ndarray
+    bulge: float
+    inverse_area: float
+
+
+@nb.njit(inline="always")
+def clamped(coc):  # type: ignore[no-untyped-def]
+    """`torchbokeh.ops.spans.clamp_radius` for one pixel."""
+    r = max(abs(coc), MIN_RADIUS)
+    return -r if coc < 0.0 else r
 
 
 @nb.njit(inline="always")
@@ -39,12 +59,14 @@ def _semicircle(t):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def row_table(r, first, n, shapes, s, bulge, inv_area, rows):  # type: ignore[no-untyped-def]
-    """Fill ``rows (4, > n)`` for the rows ``first .. first+n-1`` from the centre of a PSF of radius ``r``.
+def row_table(coc, first, n, shape, rows):  # type: ignore[no-untyped-def]
+    """Fill ``rows (>= 4, > n)`` for the rows ``first .. first+n-1`` from the centre of a PSF of the radius ``coc``.
 
-    They take the left ends, the right ends, the weights and scratch. ``first`` need not be whole. ``shapes[s]`` is
-    ``(K, 7)``: y, left, right, integral of left, integral of right, slope of left and right.
+    They take the left ends, the right ends, the weights and scratch. ``first`` need not be whole. ``coc`` is signed,
+    and not 0.
     """
+    shapes, bulge, inv_area = shape
+    s, r = 1 if coc < 0.0 else 0, abs(coc)
     left, right, weight, arcs = rows[0], rows[1], rows[2], rows[3]
     knots = shapes.shape[1]
     bottom, top = shapes[s, 0, 0], shapes[s, knots - 1, 0]
@@ -95,16 +117,20 @@ def row_table(r, first, n, shapes, s, bulge, inv_area, rows):  # type: ignore[no
 
 
 @nb.njit(inline="always")
-def _row_range(r, y, bottom, top, y0, y1):  # type: ignore[no-untyped-def]
-    """First row and number of rows that a PSF of radius ``r`` at row ``y`` reaches within ``y0 .. y1-1``."""
+def row_range(r, y, bottom, top, y0, y1):  # type: ignore[no-untyped-def]
+    """First row and number of rows that a PSF of radius ``r`` at row ``y`` reaches within ``y0 .. y1-1``.
+
+    The unit shape runs from ``bottom`` to ``top``. The number is 0 or less where the PSF stays outside.
+    """
     first = max(y0 - y, math.ceil(max(r * bottom - 0.5, -1e9)))
     last = min(y1 - 1 - y, math.floor(min(r * top + 0.5, 1e9)))
     return first, last - first + 1
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out):  # type: ignore[no-untyped-def]
+def _splat_band(src, coc, reach, shape, integrate, y0, y1, out):  # type: ignore[no-untyped-def]
     """Splat every pixel that reaches rows ``y0 .. y1-1``; write the band of ``out (4, H, W)``."""
+    shapes = shape.tables
     height, width = coc.shape
     stride = 4 * (width + 2)
     band = np.zeros((y1 - y0) * stride, np.float64)
@@ -118,13 +144,12 @@ def _splat_band(src, coc, reach, shapes, bulge, inv_area, integrate, y0, y1, out
             p = 4 * (y * width + x)
             if src[p] == 0.0 and src[p + 1] == 0.0 and src[p + 2] == 0.0 and src[p + 3] == 0.0:
                 continue
-            c = np.float64(coc[y, x])
+            c = clamped(np.float64(coc[y, x]))
             s = 1 if c < 0.0 else 0
-            r = max(abs(c), MIN_RADIUS)
-            first, n = _row_range(r, y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
+            first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
             if n <= 0:
                 continue
-            row_table(r, first, n, shapes, s, bulge, inv_area, rows)
+            row_table(c, first, n, shape, rows)
             o = (y + first - y0) * stride
             for k in range(n):
                 # What starts left of the image starts at its border; what ends right of it never ends.
@@ -169,8 +194,13 @@ def _edges_at(shapes, s, piece, y, bulge, half, middle):  # type: ignore[no-unty
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def row_slopes(r, first, n, shapes, s, bulge, inv_area, rows, slopes):  # type: ignore[no-untyped-def]
-    """Derivatives ``slopes (3, n)`` by the radius of the ``rows`` that `row_table` has filled: left, right, weight."""
+def row_slopes(coc, first, n, shape, rows):  # type: ignore[no-untyped-def]
+    """Derivatives by the radius of the ``rows (7, > n)`` that `row_table` has filled, left, right and weight.
+
+    They go to ``rows[4:]``.
+    """
+    shapes, bulge, inv_area = shape
+    s, r = 1 if coc < 0.0 else 0, abs(coc)
     knots = shapes.shape[1]
     bottom, top = shapes[s, 0, 0], shapes[s, knots - 1, 0]
     half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
@@ -189,31 +219,31 @@ def row_slopes(r, first, n, shapes, s, bulge, inv_area, rows, slopes):  # type: 
         while upper < knots - 2 and shapes[s, upper + 1, 0] <= high:
             upper += 1
         high_left, high_right = _edges_at(shapes, s, upper, high, bulge, half, middle)
-        slopes[0, k] = _edge_slope(r, rows[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
-        slopes[1, k] = _edge_slope(r, rows[1, k] * inv, low, high, low_right, high_right, d_low, d_high)
-        slopes[2, k] = ((d_high - d_low) * inv_area - rows[2, k]) * inv
+        rows[4, k] = _edge_slope(r, rows[0, k] * inv, low, high, low_left, high_left, d_low, d_high)
+        rows[5, k] = _edge_slope(r, rows[1, k] * inv, low, high, low_right, high_right, d_low, d_high)
+        rows[6, k] = ((d_high - d_low) * inv_area - rows[2, k]) * inv
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad_coc):  # type: ignore[no-untyped-def]
+def _gather_band(src, coc, shape, grad, y0, y1, grad_src, grad_coc):  # type: ignore[no-untyped-def]
     """Adjoint of the splat for the pixels of rows ``y0 .. y1-1``.
 
     ``grad (H, W+2, 4)`` is the gradient of the differences. Adds to ``grad_src (H*W*4)``, ``grad_coc (H, W)``.
     """
+    shapes = shape.tables
     height, width = coc.shape
-    rows, slopes = np.empty((4, height + 1), np.float64), np.empty((3, height), np.float64)
+    rows = np.empty((7, height + 1), np.float64)
     right_border = np.float64(width)
     pixel = np.empty(4, np.float64)
     total = np.empty(4, np.float64)
     for y in range(y0, y1):
         for x in range(width):
             p = 4 * (y * width + x)
-            c = np.float64(coc[y, x])
+            c = clamped(np.float64(coc[y, x]))
             s = 1 if c < 0.0 else 0
-            r = max(abs(c), MIN_RADIUS)
-            first, n = _row_range(r, y, shapes[s, 0, 0], shapes[s, -1, 0], 0, height)
-            row_table(r, first, n, shapes, s, bulge, inv_area, rows)
-            row_slopes(r, first, n, shapes, s, bulge, inv_area, rows, slopes)
+            first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], 0, height)
+            row_table(c, first, n, shape, rows)
+            row_slopes(c, first, n, shape, rows)
             for k in range(4):
                 pixel[k] = src[p + k]
                 total[k] = 0.0
@@ -239,41 +269,37 @@ def _gather_band(src, coc, shapes, bulge, inv_area, grad, y0, y1, grad_src, grad
                     by_left += (b - a) * pixel[ch]
                     by_right -= (e - d) * pixel[ch]
                 if left_moves:
-                    slope += by_left * w * slopes[0, k]
+                    slope += by_left * w * rows[4, k]
                 if right_moves:
-                    slope += by_right * w * slopes[1, k]
-                slope += by_weight * slopes[2, k]
+                    slope += by_right * w * rows[5, k]
+                slope += by_weight * rows[6, k]
             for k in range(4):
                 grad_src[p + k] = total[k]
             if abs(c) > MIN_RADIUS:
                 grad_coc[y, x] += slope if c > 0.0 else -slope
 
 
-def shape_tables(profile: Profile) -> tuple[np.ndarray, float, float]:
-    """The tables of the upright and of the point-mirrored shape ``(2, K, 7)``, the bulge and 1/area."""
+def shape_of(profile: Profile) -> Shape:
+    """The shape of a profile, in double."""
     knots = profile.knots.detach().double()
     upright = (knots, torch.stack([-knots[:, 0], -knots[:, 2], -knots[:, 1]], 1).flip(0))
     tables = []
-    for shape in upright:
-        rise = shape[1:, :1] - shape[:-1, :1]
-        slopes = torch.where(rise > 1e-9, (shape[1:, 1:] - shape[:-1, 1:]) / rise.clamp_min(1e-9), 0.0)
-        tables.append(torch.cat([shape, knot_integrals(shape), torch.cat([slopes, slopes[-1:]])], 1))
-    inv_area = 1.0 / area(Profile(knots, profile.bulge.detach().double()))
-    return torch.stack(tables).numpy(), float(profile.bulge), float(inv_area)
-
-
-def _bands(height: int) -> list[tuple[int, int]]:
-    return [(y, min(y + BAND, height)) for y in range(0, height, BAND)]
+    for side in upright:
+        rise = side[1:, :1] - side[:-1, :1]
+        slopes = torch.where(rise > 1e-9, (side[1:, 1:] - side[:-1, 1:]) / rise.clamp_min(1e-9), 0.0)
+        tables.append(torch.cat([side, knot_integrals(side), torch.cat([slopes, slopes[-1:]])], 1))
+    inverse_area = 1.0 / area(Profile(knots, profile.bulge.detach().double()))
+    return Shape(torch.stack(tables).numpy(), float(profile.bulge), float(inverse_area))
 
 
 def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
     """`torchbokeh.ops.splat.splat_spans` for CPU float32."""
     b, c, h, w = values.shape
     groups = -(-c // 4)
-    shapes, bulge, inv_area = shape_tables(profile)
+    shape = shape_of(profile)
     src = interleave(values.detach()).numpy()
     coc_np = coc.detach().contiguous().numpy()
-    extent = max(abs(shapes[0, 0, 0]), abs(shapes[0, -1, 0]))
+    extent = max(abs(shape.tables[0, 0, 0]), abs(shape.tables[0, -1, 0]))
     reach = (coc.detach().abs().amax((1, 3)).clamp_min(MIN_RADIUS) * extent).numpy()
     out = torch.empty(b * groups, 4, h, w, dtype=torch.float32)
     out_np = out.numpy()
@@ -281,9 +307,9 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) 
     def work(k: int, y0: int, y1: int) -> None:
         n = k // groups
         flat = src[k].reshape(-1)
-        _splat_band(flat, coc_np[n, 0], reach[n], shapes, bulge, inv_area, integrate, y0, y1, out_np[k])
+        _splat_band(flat, coc_np[n, 0], reach[n], shape, integrate, y0, y1, out_np[k])
 
-    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in row_bands(h, BAND)])
     return out.reshape(b, 4 * groups, h, w)[:, :c].contiguous()
 
 
@@ -291,7 +317,7 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
     """Adjoint: gradient ``(B, C, H, W)`` of the differences to the gradients of ``values`` and ``coc``."""
     b, c, h, w = values.shape
     groups = -(-c // 4)
-    shapes, bulge, inv_area = shape_tables(profile)
+    shape = shape_of(profile)
     src = interleave(values.detach()).numpy()
     differences = torch.nn.functional.pad(interleave(grad.double()), (0, 0, 0, 2)).numpy()
     coc_np = coc.detach().contiguous().numpy()
@@ -302,10 +328,9 @@ def gather_spans(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) ->
     def work(k: int, y0: int, y1: int) -> None:
         n = k // groups
         _gather_band(
-            *(src[k].reshape(-1), coc_np[n, 0], shapes, bulge, inv_area, differences[k], y0, y1),
+            *(src[k].reshape(-1), coc_np[n, 0], shape, differences[k], y0, y1),
             *(grad_src_np[k].reshape(-1), grad_coc_np[k % groups, n, 0]),
         )
 
-    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in _bands(h)])
-    grad_values = grad_src.permute(0, 3, 1, 2).reshape(b, 4 * groups, h, w)[:, :c].contiguous()
-    return grad_values, grad_coc.sum(0).to(coc.dtype)
+    run_all(work, [(k, y0, y1) for k in range(b * groups) for y0, y1 in row_bands(h, BAND)])
+    return separate(grad_src, c), grad_coc.sum(0).to(coc.dtype)

@@ -75,6 +75,11 @@ def run_all(work: Callable[..., None], pieces: Iterable[tuple[Any, ...]], name: 
         raise errors[0]
 
 
+def row_bands(height: int, rows: int) -> list[tuple[int, int]]:
+    """Pieces of work: a picture of that height in bands of so many rows, first and one past the last of each."""
+    return [(y, min(y + rows, height)) for y in range(0, height, rows)]
+
+
 def _join(threads: list[threading.Thread]) -> None:
     for thread in threads:
         if thread.is_alive():  # one that could not be started is not

@@ -15,7 +15,7 @@ from torch.func import functional_call
 from torch.nn import functional as F
 
 import torchbokeh.ops.merge
-from torchbokeh.ops import dispatch as _dispatch
+from torchbokeh.ops import dispatch
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import (
     FADE,
@@ -901,16 +901,16 @@ def test_without_numba_the_torch_path_takes_over_and_says_so_once(monkeypatch: p
     want = splat_merged(values, coc, profile, MIDDLE, ones=True)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "numba" else find(name, *a))
-    for kernels in ("_merge_kernels", "_span_kernels"):
-        monkeypatch.setitem(torchbokeh.ops.__dict__, kernels, None)
-    _dispatch.numba_is_there.cache_clear()
+    for name in ("merge", "splat"):
+        monkeypatch.setattr(torchbokeh.ops.kernels, name, None)
+    dispatch.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"numba is not installed.*pip install torchbokeh\[cpu\]"):
             assert_close(splat_merged(values, coc, profile, MIDDLE, ones=True), want, 1e-5)
         splat_merged(values, coc, profile, MIDDLE)  # a second warning would be an error
     finally:
         monkeypatch.undo()
-        _dispatch.numba_is_there.cache_clear()
+        dispatch.numba_is_there.cache_clear()
 
 
 def test_examples() -> None:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh.ops.planes
-from torchbokeh.ops import dispatch as _dispatch
-from torchbokeh.ops.kernels import planes as _plane_kernels
+from torchbokeh.ops import dispatch
+from torchbokeh.ops.kernels import planes as kernels
 from torchbokeh.ops.planes import Plates, _render_planes_torch, render_planes
 
 F32, F64 = torch.float32, torch.float64
@@ -118,7 +118,7 @@ def test_parents_stand_for_their_children(
     memory: int, frames: bool, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same bits as without copies, whether they fit into memory or not."""
-    monkeypatch.setattr(_plane_kernels, "MEMORY", memory)
+    monkeypatch.setattr(kernels, "MEMORY", memory)
     size = (35, 29)
     for seed in range(12 if dtype == F32 else 3):
         plates, inverse, level = scene(24, 5, size, seed)
@@ -152,9 +152,9 @@ def test_copies_take_no_more_memory_than_allowed(monkeypatch: pytest.MonkeyPatch
     sizes = np.full((3, 1, 2), 6)
     parents = torch.tensor([[0, n // 6, n // 2] for n in range(12)])  # of 12, 6 and 2 children
     for strips, kept in ((0, []), (1, [12]), (2, [12, 6]), (4, [12, 6, 6, 2]), (99, [12, 6, 6, *[2] * 6])):
-        strip = 9 * _plane_kernels.BAND * 16  # columns 4 to 12, of 16 bytes each pixel
-        monkeypatch.setattr(_plane_kernels, "MEMORY", strips * strip)
-        copy, columns = _plane_kernels._copies(plates, sizes, inverse.numpy(), level, (20, 24), parents)
+        strip = 9 * kernels.BAND * 16  # columns 4 to 12, of 16 bytes each pixel
+        monkeypatch.setattr(kernels, "MEMORY", strips * strip)
+        copy, columns = kernels._copies(plates, sizes, inverse.numpy(), level, (20, 24), parents)
         assert [int((copy == c).sum()) for c in range(len(columns))] == kept
         assert (columns == [4, 9]).all()
 
@@ -205,12 +205,12 @@ def test_without_numba_the_definition_takes_over(monkeypatch: pytest.MonkeyPatch
     fast = render_planes(plates, inverse, level, (15, 17))[0]
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "numba" else find_spec(name))
-    _dispatch.numba_is_there.cache_clear()
+    dispatch.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba is not installed"):
             slow = render_planes(plates, inverse, level, (15, 17))[0]
     finally:
-        _dispatch.numba_is_there.cache_clear()
+        dispatch.numba_is_there.cache_clear()
     assert torch.allclose(fast, slow, atol=2e-5)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import torchbokeh.ops.points
-from torchbokeh.ops import dispatch as _dispatch
+from torchbokeh.ops import dispatch
 from torchbokeh.ops.dense import dense_points
 from torchbokeh.ops.points import PointTable, splat_points
 
@@ -254,12 +254,12 @@ def test_operators_keep_the_rules_of_torch(dtype: torch.dtype, rotated: bool, mo
     values, index, frame = scene(1, 3, 4, 5, dtype, rotated, moved)
     points = table(whole=False, dtype=F64)
     rotation, position = (frame[k].double() if k in frame else None for k in ("rotation", "position"))
-    args = (index, *points, rotation, position)
+    args = (index, [*points], rotation, position, 2)
     op = torch.ops.torchbokeh
-    torch.library.opcheck(op.splat_points.default, (values.requires_grad_(), *args, 2, (4, 5)))
+    torch.library.opcheck(op.splat_points.default, (values.requires_grad_(), *args, (4, 5)))
     grad = torch.rand(1, 3, 8, 9, dtype=dtype)
     for geometry in (True, False):
-        torch.library.opcheck(op.gather_points.default, (grad, values.detach(), *args, 2, (4, 5), geometry))
+        torch.library.opcheck(op.gather_points.default, (grad, values.detach(), *args, geometry))
 
 
 def test_compiles_to_one_graph_for_any_size() -> None:
@@ -367,15 +367,15 @@ def test_without_numba_the_torch_path_takes_over_and_says_so_once(monkeypatch: p
     want = splat_points(values, index, table(), pad=3, **frame)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "numba" else find(name, *a))
-    monkeypatch.setitem(torchbokeh.ops.__dict__, "_point_kernels", None)
-    _dispatch.numba_is_there.cache_clear()
+    monkeypatch.setattr(torchbokeh.ops.kernels, "points", None)
+    dispatch.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba is not installed"):
             assert_close(splat_points(values, index, table(), pad=3, **frame), want, 1e-6)
         splat_points(values, index, table(), pad=3)  # a second warning would be an error
     finally:
         monkeypatch.undo()
-        _dispatch.numba_is_there.cache_clear()
+        dispatch.numba_is_there.cache_clear()
 
 
 def test_examples() -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import torchbokeh.ops.raycast
-from torchbokeh.ops import dispatch as _dispatch
+from torchbokeh.ops import dispatch
 from torchbokeh.ops.raycast import coc_bounds, subsample_blur
 
 F32, F64 = torch.float32, torch.float64
@@ -271,12 +271,12 @@ def test_without_numba_the_definition_takes_over(monkeypatch: pytest.MonkeyPatch
     fast = subsample_blur(colour, coc, offsets)
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "numba" else find_spec(name))
-    _dispatch.numba_is_there.cache_clear()
+    dispatch.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba is not installed"):
             slow = subsample_blur(colour, coc, offsets)
     finally:
-        _dispatch.numba_is_there.cache_clear()
+        dispatch.numba_is_there.cache_clear()
     assert torch.allclose(fast, slow, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ from torch.func import functional_call
 from torch.utils.data import DataLoader, Dataset
 
 import torchbokeh.ops.splat
-from torchbokeh.ops import dispatch as _dispatch
+from torchbokeh.ops import dispatch
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import Merging, splat_merged
@@ -336,15 +336,15 @@ def test_without_numba_the_torch_path_takes_over_and_says_so_once(monkeypatch: p
     want = splat_spans(values, coc, profile)
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "numba" else find(name, *a))
-    monkeypatch.setitem(torchbokeh.ops.__dict__, "_span_kernels", None)
-    _dispatch.numba_is_there.cache_clear()
+    monkeypatch.setattr(torchbokeh.ops.kernels, "splat", None)
+    dispatch.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"numba is not installed.*pip install torchbokeh\[cpu\]"):
             assert_close(splat_spans(values, coc, profile), want, 1e-6)
         splat_spans(values, coc, profile)  # a second warning would be an error
     finally:
         monkeypatch.undo()
-        _dispatch.numba_is_there.cache_clear()
+        dispatch.numba_is_there.cache_clear()
 
 
 def test_examples() -> None:

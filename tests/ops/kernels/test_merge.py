@@ -3,7 +3,6 @@ import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
-import numba as nb
 import numpy as np
 import pytest
 import torch
@@ -11,31 +10,15 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, Dataset
 
-from torchbokeh.ops.kernels import merge as _merge_kernels
-from torchbokeh.ops.kernels import merge_gather as _merge_gather
-from torchbokeh.ops.kernels.merge import bank_of
-from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, collect
-from torchbokeh.ops.kernels.psf_bank import Bank, psf_bank
-from torchbokeh.ops.kernels.rows import draw_rows, gather_rows, running_sum
-from torchbokeh.ops.kernels.splat import shape_tables
+from torchbokeh.ops.kernels import merge_gather
+from torchbokeh.ops.kernels.merge import bank_for
+from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, collect
 from torchbokeh.ops.merge import MARGIN, SPREAD, STEPS, Merging, level_shares, merge_cells, splat_merged, upsample
-from torchbokeh.ops.splat import splat_spans
 from torchbokeh.ops.system.threads import recorded, run_all, stage
-from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
+from torchbokeh.psfs import Aperture, Disc, Polygon
 
 F32, F64 = torch.float32, torch.float64
 MIDDLE, COARSE = Merging(4, 0.015), Merging(2.5, 0.03)
-SHAPES = {
-    "disc": Disc(),
-    "ellipse": Ellipse(1.8, 0.5),
-    "hexagon": Polygon(6, 0.3),
-    "round blades": Polygon(5, 0.4, 0.7),
-}
-
-
-@pytest.fixture(params=SHAPES)
-def shape(request: pytest.FixtureRequest) -> Aperture:
-    return SHAPES[request.param]
 
 
 def scene(b: int, c: int, h: int, w: int, reach: float = 60.0, seed: int = 1) -> tuple[Tensor, Tensor]:
@@ -281,11 +264,11 @@ def test_operators_keep_the_rules_of_torch() -> None:
     knots, bulge = Polygon(5).profile()
     weight = weights(coc).clamp_min(0.1).requires_grad_()
     for ones, normalise, factor in ((False, False, None), (True, True, weight)):
-        args = (values, coc, factor, knots, bulge, *MIDDLE, 1, ones, normalise)
+        args = (values, coc, factor, [knots, bulge], MIDDLE, 1, ones, normalise)
         torch.library.opcheck(torch.ops.torchbokeh.splat_merged.default, args)
         args = tuple(a.detach() if isinstance(a, Tensor) else a for a in args)
         out = torch.ops.torchbokeh.splat_merged(*args)
-        args = (torch.rand_like(out), out if normalise else None, *args[:-1])
+        args = (torch.rand_like(out), out if normalise else None, *args[:-2])
         torch.library.opcheck(torch.ops.torchbokeh.gather_merged.default, args)
 
 
@@ -367,8 +350,7 @@ def test_a_value_that_is_no_number_spoils_no_gradient_but_its_own_cell(bad: floa
 
 def collected(values: Tensor, coc: Tensor, highest: int, group: int = 0, weight: Tensor | None = None) -> Levels:
     lanes = Lanes.of(group, values.shape[1], True)
-    factor = _merge_kernels.planes_of(weight, 1)[0]
-    return collect(values[0].numpy(), coc[0, 0].numpy(), factor, lanes, MIDDLE, highest)
+    return collect(Picture.each(values, coc, weight)[0], lanes, MIDDLE, highest)
 
 
 @pytest.mark.parametrize("size", [(100, 70), (129, 31), (3, 5)])
@@ -423,7 +405,7 @@ def test_the_mean_is_that_of_pixels_that_hold_anything(weighted: bool) -> None:
     weight = weights(coc) if weighted else None
     counted = (values != 0).any(1, keepdim=True) * (1.0 if weight is None else weight)
     want = (values * counted).sum((0, 2, 3)) / counted.sum()
-    np.testing.assert_allclose(collected(values, coc, 2, weight=weight).bounds, want, rtol=1e-5)
+    np.testing.assert_allclose(collected(values, coc, 2, weight=weight).thresholds.means, want, rtol=1e-5)
 
 
 BYTES = {"collect": 20, "forward": 24, "backward": 80}
@@ -459,145 +441,8 @@ def test_memory_is_bounded() -> None:
     out = peak("forward", lambda: splat_merged(values.requires_grad_(), coc, profile, MIDDLE, ones=True))
     peak("backward", lambda: out.sum().backward())
     assert all(1 < peaks[k] < BYTES[k] for k in BYTES), peaks
-    kept = sum(array.nbytes for array in levels)
+    kept = sum(array.nbytes for array in (levels.thresholds.means, *levels[1:]))
     assert kept < 12 * h * w
-
-
-# Banks of PSFs.
-
-
-def bank_for(shape: Aperture, largest: float = 9.0, slopes: bool = False) -> Bank:
-    return psf_bank(largest, STEPS, *shape_tables(shape.profile()), slopes=slopes)
-
-
-def drawn(bank: Bank, k: int, table: np.ndarray, reach: int = 12) -> np.ndarray:
-    """PSF ``k`` of a bank as a picture, in plain Python."""
-    psf = np.zeros((2 * reach + 1, 2 * reach + 3))
-    for row in range(bank.ends[k], bank.ends[k + 1]):
-        y = reach + bank.firsts[k] + row - bank.ends[k]
-        for end in range(2):
-            column = reach + bank.columns[row, end]
-            psf[y, column : column + 2] += table[row, 2 * end : 2 * end + 2]
-    return psf.cumsum(1)[:, : 2 * reach + 1]
-
-
-def dots(coc: Tensor, reach: int = 12) -> tuple[Tensor, Tensor]:
-    side = 2 * reach + 1
-    values = torch.zeros(len(coc), 1, side, side, dtype=F64)
-    values[..., reach, reach] = 1
-    return values, coc[:, None, None, None].expand_as(values)
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_bank_holds_the_psfs_of_its_radii(shape: Aperture, sign: int) -> None:
-    bank = bank_for(shape)
-    count = 9 * STEPS + 1
-    assert len(bank.firsts) == (2 * count if bank.mirrored else count)
-    assert len(bank.ends) == len(bank.firsts) + 1
-    assert bank.slopes.shape == (0, 4)
-    numbers = [*range(0, count, 37), count - 1]
-    want = splat_spans(*dots(sign * torch.tensor(numbers, dtype=F64) / STEPS), shape.profile(), integrate=True)
-    for k, psf in zip(numbers, want, strict=True):
-        got = drawn(bank, k + (bank.mirrored if sign < 0 else 0), bank.weights)
-        np.testing.assert_allclose(got, psf[0], rtol=0, atol=1e-9 * float(psf.max()))
-        assert got.sum() == pytest.approx(1, abs=1e-10)
-    # A column further than the radius, the next one that each end adds to, and one for what is rounded.
-    assert np.abs(bank.columns).max() + 1 <= bank.reach <= 9 + 2
-
-
-def test_only_a_shape_without_symmetry_has_a_mirrored_half() -> None:
-    for symmetric in (Disc(), Ellipse(1.8, 0.5), Polygon(6, 0.3), Polygon(4)):
-        assert bank_for(symmetric).mirrored == 0
-    for blades in (3, 5, 7):
-        bank = bank_for(Polygon(blades, 0.2))
-        assert bank.mirrored == len(bank.firsts) // 2
-        for k in (40, 300, 500):
-            front, behind = (drawn(bank, k + start, bank.weights) for start in (bank.mirrored, 0))
-            np.testing.assert_allclose(front, behind[::-1, ::-1], atol=1e-12)
-            assert np.abs(front - behind).max() > 1e-4
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_slopes_are_derivatives_by_the_radius(shape: Aperture, sign: int) -> None:
-    bank = bank_for(shape, slopes=True)
-    assert bank.slopes.shape == bank.weights.shape
-    step = 1e-5
-    numbers = [35, 77, 151, 333, 401, 563]
-    radius = torch.tensor(numbers, dtype=F64) / STEPS
-    ends = [splat_spans(*dots(sign * (radius + d)), shape.profile(), integrate=True) for d in (step, -step)]
-    want = (ends[0] - ends[1])[:, 0] / (2 * step)
-    for k, slope in zip(numbers, want, strict=True):
-        got = drawn(bank, k + (bank.mirrored if sign < 0 else 0), bank.slopes)
-        np.testing.assert_allclose(got, slope, rtol=0, atol=1e-5 * float(slope.abs().max()))
-        assert np.abs(got).max() > 0
-    for k in (0, 10, 32):  # up to MIN_RADIUS, the PSF stays as it is
-        assert np.abs(drawn(bank, k, bank.slopes)).max() == 0
-
-
-# Vector code.
-
-
-@nb.njit
-def _draw(band, o, stride, src, p, columns, weights, start, stop):  # type: ignore[no-untyped-def]
-    draw_rows(band, o, stride, src, p, columns, weights, start, stop)
-
-
-@nb.njit
-def _gather(sums, o, stride, columns, weights, slopes, start, stop, found):  # type: ignore[no-untyped-def]
-    gather_rows(sums, o, stride, columns, weights, slopes, start, stop, found)
-
-
-@nb.njit
-def _sum_along(band, o, skipped, fine, row, count):  # type: ignore[no-untyped-def]
-    running_sum(band, o, skipped, fine, row, count)
-
-
-def test_rows_are_drawn_where_they_belong_and_gathered_from_there() -> None:
-    draw = np.random.default_rng(0)
-    rows, width = 9, 20
-    stride = 4 * width
-    columns, weights, slopes = draw.integers(-4, 5, (rows, 2)), draw.normal(size=(rows, 4)), draw.normal(size=(rows, 4))
-    src = draw.normal(size=12).astype(np.float32)
-    for start, stop, centre, p in ((0, 9, 7, 0), (2, 5, 5, 4), (3, 3, 6, 8), (8, 9, 12, 5)):
-        before = draw.normal(size=rows * stride)
-        want, band = before.copy().reshape(rows, width, 4), before.copy()
-        for k in range(start, stop):
-            for end in range(2):
-                for side in range(2):
-                    at = centre + columns[k, end] + side
-                    want[1 + k - start if stop - start < rows else k, at] += weights[k, 2 * end + side] * src[p : p + 4]
-        o = (stride if stop - start < rows else 0) + 4 * centre
-        _draw(band, o, stride, src, p, columns, weights, start, stop)
-        np.testing.assert_allclose(band.reshape(want.shape), want, rtol=0, atol=1e-14)
-        # The transpose: what a pixel of 1 would have added, times what is there.
-        sums, found = draw.normal(size=rows * stride), np.full(8, np.nan)
-        _gather(sums, o, stride, columns, weights, slopes, start, stop, found)
-        for lane in range(4):
-            one = np.zeros(4, np.float32)
-            one[lane] = 1
-            for table, got in ((weights, found[lane]), (slopes, found[4 + lane])):
-                band = np.zeros(rows * stride)
-                _draw(band, o, stride, one, 0, columns, table, start, stop)
-                assert got == pytest.approx(band @ sums, abs=1e-12)
-
-
-@pytest.mark.parametrize(("o", "skipped", "count"), [(0, 0, 11), (16, 5, 9), (4, 3, 0), (8, 0, 1)])
-def test_the_running_sum_is_that_of_numpy(o: int, skipped: int, count: int) -> None:
-    draw = np.random.default_rng(1)
-    band = draw.normal(size=100) * 1e3
-    fine, row = draw.normal(size=4 * count + 4).astype(np.float32), np.full(4 * count + 4, 7, np.float32)
-    _sum_along(band, o, skipped, fine, row, count)
-    sums = band[o : o + 4 * (skipped + count)].reshape(-1, 4).cumsum(0)[skipped:].astype(np.float32)
-    np.testing.assert_array_equal(row[: 4 * count], sums.reshape(-1) + fine[: 4 * count])
-    assert (row[4 * count :] == 7).all()
-
-
-def test_the_running_sum_is_taken_in_double() -> None:
-    band = np.zeros(4 * 1000)
-    band[:4], band[4:8] = 1e9 + 0.125, -1e9
-    row = np.empty(4 * 998, np.float32)
-    _sum_along(band, 0, 2, np.zeros_like(row), row, 998)
-    assert (row == 0.125).all()
 
 
 @pytest.mark.parametrize("margin", [0, MARGIN])
@@ -611,7 +456,7 @@ def test_gradients_go_down_a_level_by_the_transpose_of_the_interpolation(size: t
     (want,) = torch.autograd.grad(up, coarse, fine.movedim(2, 0)[None])
     got = np.full((*coarse.shape[2:], 4), np.nan, np.float32)
     for y0, y1 in ((0, 3), (3, len(got))):
-        _merge_gather._down(fine.numpy(), margin, got, y0, y1)
+        merge_gather._down(fine.numpy(), margin, got, y0, y1)
     assert_close(torch.from_numpy(got).movedim(2, 0), want[0], 1e-6)
 
 
@@ -677,8 +522,8 @@ def test_what_has_no_weight_may_be_no_number(dtype: torch.dtype, radius: float) 
 def test_the_bank_stays_small_where_nothing_is_to_be_merged() -> None:
     values, coc = scene(1, 3, 60, 50, 40.0)
     huge = MIDDLE._replace(cells=1000.0)
-    bank = bank_of(huge, shape_tables(Disc().profile()), slopes=True)
-    assert sum(t.nbytes for t in bank[3:]) < 2**25
+    bank = bank_for(Disc().profile(), huge, slopes=True)
+    assert sum(t.nbytes for t in (bank.firsts, bank.ends, *bank.rows)) < 2**25
     got, want = (
         splat_merged(v, c, Disc().profile(), huge) for v, c in ((values, coc), (values.double(), coc.double()))
     )

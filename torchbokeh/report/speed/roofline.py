@@ -40,25 +40,25 @@ def _points_per_second(seconds: float) -> float:
     import numba as nb
     import numpy as np
 
-    from torchbokeh.ops.kernels.rows import draw_rows
+    from torchbokeh.ops.kernels.rows import PsfRows, draw_rows
 
     rows, width = 16, 1000
     stride = 4 * (width + 40)
 
     @nb.njit(nogil=True)
-    def draw(band, pixels, columns, weights):  # type: ignore[no-untyped-def]
+    def draw(band, pixels, psf):  # type: ignore[no-untyped-def]
         for x in range(width):
-            draw_rows(band, 4 * (x + 20), stride, pixels, 4 * x, columns, weights, 0, rows)
+            draw_rows(band, 4 * (x + 20), stride, pixels, 4 * x, psf, (0, rows))
 
     half = np.sqrt((rows / 2) ** 2 - (np.arange(rows) - (rows - 1) / 2) ** 2)
     columns = np.floor(np.stack([0.5 - half, 0.5 + half], 1)).astype(np.int64)
-    weights, pixels = np.ones((rows, 4)), np.ones(4 * width, np.float32)
+    psf, pixels = PsfRows(columns, np.ones((rows, 4)), np.empty((0, 4))), np.ones(4 * width, np.float32)
     threads = torch.get_num_threads()
     bands = [np.zeros(stride * rows) for _ in range(threads)]
 
     def all_threads() -> None:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda band: [draw(band, pixels, columns, weights) for _ in range(20)], bands))
+            list(pool.map(lambda band: [draw(band, pixels, psf) for _ in range(20)], bands))
 
     return threads * 20 * width * rows * 2 / _best(all_threads, seconds)
 
