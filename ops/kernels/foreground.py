@@ -135,24 +135,10 @@ def rest(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _double(half, y, beyond, line, out):  # type: ignore[no-untyped-def]
-    """Row ``y`` of ``half`` with twice as many cells, as `merge.upsample`; it starts ``beyond`` cells outside."""
-    row = (y >> 1) + beyond
-    here, beside = half[row], half[row + 1 if y & 1 else row - 1]
-    for x in range(len(line)):
-        line[x] = np.float32(0.75) * here[x] + np.float32(0.25) * beside[x]
-    before, middle, after = line[beyond - 1 :], line[beyond:], line[beyond + 1 :]
-    for x in range(len(out) >> 1):
-        out[2 * x] = np.float32(0.75) * middle[x] + np.float32(0.25) * before[x]
-        out[2 * x + 1] = np.float32(0.75) * middle[x] + np.float32(0.25) * after[x]
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _over(ahead, front, half, beyond, certain, behind, y0, y1):  # type: ignore[no-untyped-def]
+def _over(front, certain, ahead, whole, behind, y0, y1):  # type: ignore[no-untyped-def]
     (colour, coverage), (target, density) = ahead, behind
     channels, _, width = colour.shape
     zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(TINY)
-    line, large = np.empty(half.shape[1], np.float32), np.empty(width + (width & 1), np.float32)
     share, rest = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(y0, y1):
         covered, share_ahead, count = coverage[y], front[y], density[y]
@@ -161,11 +147,10 @@ def _over(ahead, front, half, beyond, certain, behind, y0, y1):  # type: ignore[
             most = max(most, covered[x])
         if most == zero:
             continue
-        _double(half, y, beyond, line, large)
+        full = whole[y]
         for x in range(width):
-            whole = max(large[x], zero)
-            stopped = min(covered[x] / max(whole, tiny), one)
-            known = min(certain * whole, one)
+            stopped = min(covered[x] / max(full[x], tiny), one)
+            known = min(certain * max(full[x], zero), one)
             absent = one if share_ahead[x] == zero else zero
             vote = stopped * known
             left = (absent + known * (one - stopped - absent)) * min(certain * count[x], one)
@@ -178,15 +163,14 @@ def _over(ahead, front, half, beyond, certain, behind, y0, y1):  # type: ignore[
 
 
 def over(
+    front: np.ndarray,
+    certain: float,
     colour: np.ndarray,
     coverage: np.ndarray,
-    front: np.ndarray,
-    half: np.ndarray,
-    beyond: int,
-    certain: float,
+    whole: np.ndarray,
     behind: np.ndarray,
     density: np.ndarray,
 ) -> None:
     """Put a foreground over ``behind (C, H, W)``, in place, as `compose` does for the whole lens."""
     ahead, back = Layer(colour, coverage), Layer(behind, density)
-    run_all(partial(_over, ahead, front, half, beyond, np.float32(certain), back), bands(len(front)), "over")
+    run_all(partial(_over, front, np.float32(certain), ahead, whole, back), bands(len(front)), "over")

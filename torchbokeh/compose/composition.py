@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchbokeh.banks.splat import splat_bank
-from torchbokeh.compose.density import block_sums, enlarged_density, half_density, moving_density
 from torchbokeh.compose.surfaces import Surface
 from torchbokeh.ops.composite import TINY, bin_weights, fill_until_full
 from torchbokeh.ops.merge import splat_merged
@@ -36,16 +35,13 @@ def blurred(surface: Surface, profile: Profile, detail: Detail) -> tuple[Tensor,
         density of its splats: 1 where blur is even, more or less where it varies, 0 where the picture does not know
         the surface, beyond the border or behind something else.
     """
-    alpha, coc, (merging, highest, coarse), exposure = surface.alpha, surface.coc, detail, surface.exposure
+    alpha, coc, exposure, (merging, highest, _) = surface.alpha, surface.coc, surface.exposure, detail
     if merging is not None and exposure is None:
         plain = surface.colour if alpha is None else surface.colour / alpha.clamp_min(TINY)
         colour, coverage = blur_surface(plain, alpha, coc, surface.centres, profile, merging, highest)
         if alpha is None:
             return colour, torch.ones_like(coverage), coverage
-        if coarse:
-            whole = enlarged_density(half_density(*block_sums(coc, alpha), profile, detail), coc)
-        else:
-            whole = splat_merged(torch.ones_like(alpha), coc, profile, merging, highest=highest).clamp_min(0)
+        whole = splat_merged(torch.ones_like(alpha), coc, profile, merging, highest=highest).clamp_min(0)
         return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
     if exposure is None:
@@ -58,10 +54,7 @@ def blurred(surface: Surface, profile: Profile, detail: Detail) -> tuple[Tensor,
     if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.
-    if exposure is None or merging is None or not coarse:
-        whole = splat(torch.ones_like(alpha)).clamp_min(0)
-    else:
-        whole = enlarged_density(moving_density(coc, exposure, detail), coc)
+    whole = splat(torch.ones_like(alpha)).clamp_min(0)
     return colour, (coverage / whole.clamp_min(TINY)).clamp(max=1), whole
 
 

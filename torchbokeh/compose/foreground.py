@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 
 from torchbokeh.compose.composition import CERTAIN
-from torchbokeh.compose.density import BEYOND, half_density
-from torchbokeh.compose.surfaces import fill_hidden
-from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import Merging
+from torchbokeh.compose.surfaces import COARSE, enlarged, fill_hidden
+from torchbokeh.ops.composite import TINY, pull_push
+from torchbokeh.ops.merge import Merging, splat_merged
 from torchbokeh.ops.spans import Profile
 from torchbokeh.ops.surface import blur_surface
 from torchbokeh.plan.bins import FOREGROUND
@@ -44,7 +43,7 @@ def _foreground_over_rest_op(
 ) -> Tensor:
     from torchbokeh.ops.kernels import foreground as kernels
 
-    settings = Profile(*profile), Merging(*merging), highest
+    shape, extent = Profile(*profile), Merging(*merging)
     out = torch.empty_like(image)
     for n in range(len(image)):
         scene = image[n].numpy(), coc[n, 0].numpy()
@@ -55,12 +54,14 @@ def _foreground_over_rest_op(
         hidden, hidden_coc = fill_hidden(totals / known_share, total_coc / known_share, share)
         rest, rest_coc = kernels.rest(*scene, known, hidden[0].numpy(), hidden_coc[0, 0].numpy())
         picture, radius = torch.from_numpy(rest)[None], torch.from_numpy(rest_coc)[None, None]
-        rest_picture, density = blur_surface(picture, None, radius, behind, *settings)
-        alpha = torch.from_numpy(front)[None, None]
-        colour, coverage = blur_surface(image[n : n + 1], alpha, coc[n : n + 1], ahead, *settings)
-        half = half_density(here, total_here, settings[0], Detail(*settings[1:]))
-        planes = (t.contiguous().numpy() for t in (half[0, 0], rest_picture[0], density[0, 0]))
-        kernels.over(colour[0].numpy(), coverage[0, 0].numpy(), front, next(planes), BEYOND, CERTAIN, *planes)
+        rest_picture, density = blur_surface(picture, None, radius, behind, shape, extent, highest)
+        alpha, own = torch.from_numpy(front)[None, None], coc[n : n + 1]
+        colour, coverage = blur_surface(image[n : n + 1], alpha, own, ahead, shape, extent, highest)
+        beside = enlarged(pull_push(total_here / here.clamp_min(TINY), here), COARSE, front.shape)
+        continued = torch.where(alpha > 0, own, beside)
+        whole = splat_merged(torch.ones_like(alpha), continued, shape, extent, highest=highest)
+        planes = colour[0], coverage[0, 0], whole[0, 0], rest_picture[0], density[0, 0]
+        kernels.over(front, CERTAIN, *(t.contiguous().numpy() for t in planes))
         out[n] = rest_picture[0]
     return out
 

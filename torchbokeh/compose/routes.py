@@ -46,7 +46,7 @@ def surface(request: Request, plan: Plan, pieces: Pieces) -> Tensor:
     if whole and not plan.moves:
         return blur_one_layer(request.image, request.coc, pieces[1][0], plan.detail)
     one = Surface(request.image, None, request.coc, plan.bins[0], _exposure(request, plan))
-    return compose([one], pieces[plan.subapertures], plan.detail._replace(coarse=False))[0]
+    return compose([one], pieces[plan.subapertures], plan.detail)[0]
 
 
 def foreground(request: Request, plan: Plan, pieces: Pieces) -> Tensor:
@@ -71,8 +71,7 @@ def layers(request: Request, plan: Plan, pieces: Pieces) -> Tensor:
         )
         for k, bins in zip(plan.layers, plan.bins, strict=True)
     ]
-    if not (plan.detail.coarse and not plan.moves):
-        surfaces = [s.continued() for s in surfaces]
+    surfaces = [s.continued(COARSE if plan.detail.coarse else 1) for s in surfaces]
     if not surfaces:
         return torch.zeros_like(image[:, 0])
     return torch.cat(compose(surfaces, pieces[plan.subapertures], plan.detail), 1)

@@ -38,13 +38,13 @@ class Surface:
     centres: tuple[float, ...]
     exposure: Exposure | None = None
 
-    def continued(self) -> "Surface":
-        """The surface with its CoC and motion continued to where it is not."""
+    def continued(self, scale: int) -> "Surface":
+        """The surface with its CoC and motion continued to where it is not, see `continued`."""
         if self.alpha is None:
             return self
         alpha = self.alpha
-        exposure = None if self.exposure is None else self.exposure.mapped(lambda t: continued(t, alpha))
-        return replace(self, coc=continued(self.coc, alpha), exposure=exposure)
+        exposure = None if self.exposure is None else self.exposure.mapped(lambda t: continued(t, alpha, scale))
+        return replace(self, coc=continued(self.coc, alpha, scale), exposure=exposure)
 
 
 def split_foreground(
@@ -66,8 +66,7 @@ def split_foreground(
         coc: ``(B, 1, H, W)`` signed radius in px.
         behind: what the foreground hides, as colour and CoC; ``None`` for what is not known.
         centres: bins of the foreground and of the rest.
-        scale: fill in blocks of ``scale**2`` pixels: what is hidden is smooth, and blurred in the end. Above 1, the
-            CoC of the foreground is not continued beyond it.
+        scale: fill in blocks of ``scale**2`` pixels: what is hidden is smooth, and blurred in the end.
         exposure: how the picture moves; what is hidden moves as its surroundings do.
     """
     front, known = front_and_known(coc)
@@ -81,11 +80,10 @@ def split_foreground(
     ahead = behind_it = None
     if exposure is not None:
         weight = torch.maximum(known, 1e-9 * (1 - front))
-        ahead = exposure.mapped(lambda t: continued(t, front))
+        ahead = exposure.mapped(lambda t: continued(t, front, scale))
         behind_it = exposure.mapped(lambda t: known * t + (1 - known) * pull_push(t, weight))
-    front_coc = coc if scale > 1 and exposure is None else continued(coc, front)
     return [
-        Surface(image * front, front, front_coc, centres[0], ahead),
+        Surface(image * front, front, continued(coc, front, scale), centres[0], ahead),
         Surface(rest, None, rest_coc, centres[1], behind_it),
     ]
 
@@ -127,10 +125,20 @@ def _ordinary(image: Tensor, known: Tensor) -> Tensor:
     return 1 / (1 + ratio**4)
 
 
-def continued(coc: Tensor, alpha: Tensor) -> Tensor:
-    """A map of a surface, its CoC or motion, continued from its surroundings to where the surface is not."""
-    here = (alpha > 0).to(coc.dtype)
-    return torch.where(here > 0, coc, pull_push(torch.where(here > 0, coc, 0.0), here))
+def continued(t: Tensor, alpha: Tensor, scale: int = 1) -> Tensor:
+    """A map of a surface, its CoC or motion, continued from its surroundings to where the surface is not.
+
+    Args:
+        t: the map ``(B, C, H, W)``.
+        alpha: coverage ``(B, 1, H, W)`` of the surface.
+        scale: in blocks of ``scale**2`` pixels.
+    """
+    here = (alpha > 0).to(t.dtype)
+    known = torch.where(here > 0, t, 0.0)
+    if scale == 1:
+        return torch.where(here > 0, t, pull_push(known, here))
+    share, total = block_means(here, scale), block_means(known, scale)
+    return torch.where(here > 0, t, enlarged(pull_push(total / share.clamp_min(TINY), share), scale, t.shape[2:]))
 
 
 def block_means(t: Tensor, size: int) -> Tensor:
