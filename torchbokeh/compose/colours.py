@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from torchbokeh.compose.surfaces import continued
 from torchbokeh.lens.base import Lens
 from torchbokeh.lens.field_map import Field
-from torchbokeh.picture.request import Optics, Request
+from torchbokeh.picture.request import Request
 from torchbokeh.picture.sensor import STEPS
 from torchbokeh.plan.plan import Colour
 
@@ -17,15 +17,14 @@ def channels_of(colour: Colour) -> list[int]:
     return [c for c in range(3) if colour.light.rgb[c] > 0]
 
 
-def in_light(request: Request, colour: Colour, optics: Optics) -> Request:
+def in_light(request: Request, colour: Colour) -> Request:
     """The channels of a picture, with the radii and in the size that they have in light of one wavelength.
 
     Args:
-        request: the picture, in at least float32.
+        request: the picture, in at least float32, and a lens that has a dispersion.
         colour: the light.
-        optics: with a lens that has a dispersion.
     """
-    lens, limit, sensor = optics.lens, optics.max_coc, request.sensor
+    (lens, _, limit, _), sensor = request.optics, request.sensor
     assert lens is not None
     wavelength, field = colour.light.wavelength, sensor.field(request.coc)
     shift = lens.coc_shift(wavelength, sensor.width, field)

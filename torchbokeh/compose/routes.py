@@ -82,7 +82,7 @@ def _exposure(request: Request, plan: Plan, layer: int | None = None) -> Exposur
     if not plan.moves:
         return None
     motion = request.motion if plan.approaches else request.motion._replace(shutter_coc=None)
-    return exposed(motion if layer is None else motion.of_layer(layer), plan.parts)
+    return exposed(motion if layer is None else motion.mapped(lambda t: t[:, layer]), plan.parts)
 
 
 ROUTES: dict[Route, Callable[[Request, Plan, Pieces], Tensor]] = {

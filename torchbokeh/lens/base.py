@@ -1,6 +1,8 @@
 """What every lens is: depth, or disparity, to the signed circle of confusion (CoC) and back."""
 
 from abc import ABC, abstractmethod
+from copy import copy
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -49,6 +51,15 @@ class Lens(ParametricModule, ABC):
     def coc_shift(self, wavelength: float, width: int, field: Field | None = None) -> Tensor:
         """How much larger the signed CoC radius of a wavelength is in px: 0 for a lens without dispersion."""
         return torch.zeros(())
+
+    def item(self, number: int) -> Self:
+        """The lens for one item of the batch, with the dispersion for that."""
+        other = super().item(number)
+        dispersion = None if self.dispersion is None else self.dispersion.item(number)
+        if dispersion is not self.dispersion:
+            other = copy(other)
+            other._modules = {**self._modules, "dispersion": dispersion}
+        return other
 
     def forward(self, depth: Tensor, width: int) -> Tensor:
         """Same as :meth:`coc`."""

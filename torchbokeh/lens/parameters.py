@@ -1,6 +1,8 @@
 """Modules with physical parameters: numbers are buffers, what is to be learned stays as it is."""
 
+from copy import copy
 from numbers import Real
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +20,17 @@ class ParametricModule(nn.Module):
     def values(self) -> dict[str, Tensor]:
         """Name and tensor of every parameter, in the order in which :meth:`keep` got them."""
         return {name: getattr(self, name) for name in self._names}
+
+    def item(self, number: int) -> Self:
+        """The same module for one item of the batch: of values of shape ``(B,)``, that of the item."""
+        if not any(value.dim() for value in self.values().values()):
+            return self
+        other = copy(self)
+        other._parameters, other._buffers = dict(self._parameters), dict(self._buffers)
+        for name, value in self.values().items():
+            other._parameters.pop(name, None)
+            other._buffers[name] = value[number % len(value)] if value.dim() else value
+        return other
 
     def keep(self, **values: float | Tensor) -> None:
         """Keep parameters: numbers and tensors as buffers, an ``nn.Parameter`` as the one it is.

@@ -1,9 +1,8 @@
 """The motion of a picture as callers pass it: a displacement, or several, one after the other."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_image
@@ -37,15 +36,10 @@ class Motion(NamedTuple):
         """All of its maps."""
         return [*self.displacements, *([] if self.shutter_coc is None else [self.shutter_coc])]
 
-    def of_layer(self, layer: int) -> "Motion":
-        """That of one layer of several."""
-        ends = None if self.shutter_coc is None else self.shutter_coc[:, layer]
-        return self._replace(displacements=tuple(d[:, layer] for d in self.displacements), shutter_coc=ends)
-
-    def to(self, dtype: torch.dtype) -> "Motion":
-        """The same in another dtype."""
-        ends = None if self.shutter_coc is None else self.shutter_coc.to(dtype)
-        return self._replace(displacements=tuple(d.to(dtype) for d in self.displacements), shutter_coc=ends)
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Motion":
+        """The same with all maps changed."""
+        ends = None if self.shutter_coc is None else change(self.shutter_coc)
+        return self._replace(displacements=tuple(map(change, self.displacements)), shutter_coc=ends)
 
 
 def checked_displacements(image: Tensor, motion: Displacements) -> tuple[Tensor, ...]:

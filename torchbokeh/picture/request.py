@@ -47,6 +47,7 @@ class Request(NamedTuple):
         sensor: where the picture lies on it.
         clamped: where a limit cut the CoC, or None.
         labels: all that a bank of point-spread functions is asked by, where there is one.
+        optics: what turned depth into CoC.
     """
 
     image: Tensor
@@ -56,6 +57,7 @@ class Request(NamedTuple):
     sensor: Sensor
     clamped: Tensor | None = None
     labels: Labels | None = None
+    optics: Optics = Optics()
 
     @classmethod
     def of(
@@ -95,7 +97,7 @@ class Request(NamedTuple):
             if layered:
                 raise ValueError("background: expected None for layers (make it the last layer), got a background")
             behind = maps.behind(background)
-        return cls(image, maps.cut(signed), found, behind, maps.sensor, clamped)
+        return cls(image, maps.cut(signed), found, behind, maps.sensor, clamped, optics=optics)
 
     @property
     def layered(self) -> bool:
@@ -107,6 +109,25 @@ class Request(NamedTuple):
         """All tensors that a gradient may be asked for."""
         others = [*(self.background or ()), *(self.labels or ())]
         return [self.image, self.coc, *self.motion.maps, *(t for t in others if t is not None)]
+
+    def items(self) -> list["Request"]:
+        """Those of the pictures of a batch, one by one; itself, where there is but one or none."""
+        return [self] if len(self.image) < 2 else [self._item(number) for number in range(len(self.image))]
+
+    def _item(self, number: int) -> "Request":
+        def of(t: Tensor | None) -> Tensor | None:
+            return None if t is None else t[number : number + 1]
+
+        behind, lens = self.background, self.optics.lens
+        return self._replace(
+            image=self.image[number : number + 1],
+            coc=self.coc[number : number + 1],
+            motion=self.motion.mapped(lambda t: t[number : number + 1]),
+            background=None if behind is None else (behind[0][number : number + 1], of(behind[1])),
+            clamped=of(self.clamped),
+            labels=None if self.labels is None else Labels(*map(of, self.labels)),
+            optics=self.optics if lens is None else self.optics._replace(lens=lens.item(number)),
+        )
 
     def working(self) -> "Request":
         """The same in at least float32: half precision can tell neither radii nor columns of a wide picture apart."""
@@ -120,7 +141,7 @@ class Request(NamedTuple):
         return self._replace(
             image=self.image.to(dtype).contiguous(),
             coc=self.coc.to(dtype).contiguous(),
-            motion=self.motion.to(dtype),
+            motion=self.motion.mapped(lambda t: t.to(dtype)),
             background=None if behind is None else (behind[0].to(dtype), of(behind[1])),
             labels=None if labels is None else Labels(*map(of, labels)),
         )

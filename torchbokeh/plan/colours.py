@@ -8,24 +8,23 @@ from torchbokeh.lens.base import Lens
 from torchbokeh.lens.dispersion import SEEN, Dispersion
 from torchbokeh.lens.field_map import Field
 from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.picture.request import Optics, Request
+from torchbokeh.picture.request import Request
 from torchbokeh.plan.decide import decide, passed
 from torchbokeh.plan.look import Look, PlanSettings
 from torchbokeh.plan.plan import Colour, Plan
 
 
 @torch.no_grad()
-def plan_colours(plan: Plan, look: Look, settings: PlanSettings, optics: Optics, request: Request) -> Plan:
+def plan_colours(plan: Plan, look: Look, settings: PlanSettings, request: Request) -> Plan:
     """The same plan, with one for each light that the lens splits the picture into.
 
     Args:
         plan: of the picture without dispersion.
         look: at it.
         settings: what to keep to.
-        optics: with the lens.
-        request: the picture.
+        request: the picture, and the lens.
     """
-    lens = optics.lens
+    lens, limit = request.optics.lens, request.optics.max_coc
     if lens is None or lens.dispersion is None:
         return plan
     like, width = request.coc[..., :1].to(compute_dtype(request.coc)), request.sensor.width
@@ -40,7 +39,7 @@ def plan_colours(plan: Plan, look: Look, settings: PlanSettings, optics: Optics,
     shifts = [torch.stack(lens.coc_shift(one.wavelength, width, field).aminmax()) for one in light]
 
     def shifted(radii: tuple[float, ...], by: float) -> tuple[float, ...]:
-        limit, moved = optics.max_coc, tuple(r + by for r in radii)
+        moved = tuple(r + by for r in radii)
         return moved if limit is None else tuple(min(max(r, -limit), limit) for r in moved)
 
     colours = []

@@ -120,7 +120,8 @@ class KernelSplatting(nn.Module):
             coc: ``(B, 1, H, W)`` signed radius in px; only a bank whose model needs none may go without.
             depth: ``(B, 1, H, W)`` metres, for a bank whose model asks for it.
             motion: ``(B, 2, H, W)`` displacement (dx, dy) in px over the open shutter, likewise.
-            plan: a plan made earlier with `plan`; the radii are then not looked at again.
+            plan: a plan made earlier with `plan`, for all pictures of the batch; their radii are then not looked at
+                again. Without one, each picture has its own, and is what it would be alone.
 
         Returns:
             ``(B, C, H, W)`` in the dtype of ``image``, differentiable to ``image``, ``coc`` and the aperture; with a
@@ -132,9 +133,12 @@ class KernelSplatting(nn.Module):
             ValueError: shapes, devices or values do not fit: see the message.
         """
         request = self.request(image, coc, depth=depth, motion=motion)
-        plan = self.decide(request) if plan is None else fitting(plan, SplattingPlan, request)
-        pieces = self.pieces(plan)
-        return request.answered(self.paint(request, plan, pieces), *pieces[1][0])
+        pictures = []
+        for one in [request] if plan is not None else request.items():
+            own = self.decide(one) if plan is None else fitting(plan, SplattingPlan, one)
+            pieces = self.pieces(own)
+            pictures.append(one.answered(self.paint(one, own, pieces), *pieces[1][0]))
+        return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
 
     def request(
         self,

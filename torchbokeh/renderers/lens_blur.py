@@ -129,7 +129,8 @@ class LensBlur(nn.Module):
     ) -> Plan:
         """Look at a scene once and say what it needs. Arguments are those of `forward`.
 
-        Two small copies from the device, which a forward pass with ``plan=`` saves.
+        Of a batch it is one plan with all that any of the pictures needs. Two small copies from the device, which a
+        forward pass with ``plan=`` saves.
         """
         return self.decide(
             self.request(image, depth, coc=coc, motion=motion, shutter_depth=shutter_depth, background=background)
@@ -162,9 +163,8 @@ class LensBlur(nn.Module):
                 The radius changes evenly in time.
             background: what the foreground hides, for a plain image: an image ``(B, C, H, W)``, or a pair of it and
                 its depth (its CoC where ``coc`` is passed). Without one it is filled from its surroundings.
-            plan: a plan made earlier with `plan`; the scene is then not looked at again. A batch shares one plan, so
-                pictures and gradients depend a little on what else is in it: with the same plan for all, those of
-                several processes are those of one with the whole batch.
+            plan: a plan made earlier with `plan`, for all pictures of the batch; they are then not looked at again.
+                Without one, each has its own, and is what it would be alone.
 
         Returns:
             ``(B, C, H, W)``; for layers ``(B, 4, H, W)``, premultiplied. Smaller by the margin, if there is one.
@@ -176,9 +176,12 @@ class LensBlur(nn.Module):
         request = self.request(image, depth, coc=coc, motion=motion, shutter_depth=shutter_depth, background=background)
         if image.numel() == 0:
             return request.answered(image if image.dim() == 4 else image.sum(1))
-        plan = self.decide(request) if plan is None else fitting(plan, Plan, request)
-        pieces = self.pieces(plan)
-        return request.answered(self.paint(request, plan, pieces), *pieces[1][0])
+        pictures = []
+        for one in [request] if plan is not None else request.items():
+            own = self.decide(one) if plan is None else fitting(plan, Plan, one)
+            pieces = self.pieces(own)
+            pictures.append(one.answered(self.paint(one, own, pieces), *pieces[1][0]))
+        return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
 
     def request(
         self,
@@ -192,7 +195,7 @@ class LensBlur(nn.Module):
     ) -> Request:
         """Check what `forward` is called with, and turn depth into circles of confusion."""
         request = Request.of(
-            self._optics(),
+            Optics(self.lens, self.margin, self.max_coc, self.shutter),
             image,
             depth,
             coc=coc,
@@ -208,7 +211,7 @@ class LensBlur(nn.Module):
         """What a request needs."""
         settings = PlanSettings(self.quality, self.tolerance, self.layers, self.subapertures, repr(self.aperture))
         look = look_at(request, settings)
-        return plan_colours(decide(look, settings), look, settings, self._optics(), request)
+        return plan_colours(decide(look, settings), look, settings, request)
 
     def pieces(self, plan: Plan) -> Pieces:
         """The whole aperture and all of its divisions into sub-apertures that occur in a plan."""
@@ -229,7 +232,7 @@ class LensBlur(nn.Module):
             for picture in plan.pictures():
                 if picture.colour is not colour:
                     colour = picture.colour
-                    one = whole if colour is None else in_light(whole, colour, self._optics())
+                    one = whole if colour is None else in_light(whole, colour)
                 part = ROUTES[picture.plan.route](one, picture.plan, pieces)
                 mixture.add(part, colour, picture.share, layered=request.layered)
             return mixture.total()
@@ -237,9 +240,6 @@ class LensBlur(nn.Module):
     def planned(self, plan: Plan) -> Planned:
         """The same renderer with its plan fixed, for `torch.export` and the like."""
         return Planned(self, plan)
-
-    def _optics(self) -> Optics:
-        return Optics(self.lens, self.margin, self.max_coc, self.shutter)
 
 
 def _count(name: str, value: int | str, most: int) -> int | None:
