@@ -83,11 +83,11 @@ def level_shares(
 ) -> list[Tensor]:
     """Share ``(B, 1, H, W)`` of every pixel in the levels ``0 .. highest``; the shares of a pixel sum to 1.
 
-    They are a choice, not a part of the picture: no gradient runs through them.
+    They are a choice, not a part of the picture: no gradient runs through them. What is a highlight is told by the mean
+    of the picture, in which a pixel counts by its weight: black ones do as well, or lights before black would be none.
     """
     values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
-    holds = (values != 0).any(1, keepdim=True).to(values.dtype)
-    counted = holds if weight is None else holds * weight.detach()
+    counted = torch.ones_like(values[:, :1]) if weight is None else weight.detach().to(values.dtype)
     magnitude = torch.where(counted > 0, values.abs() * counted, 0.0)
     mean = magnitude.sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
@@ -183,8 +183,10 @@ def merged(
     Returns:
         ``(B, C, H, W)``, close to ``splat(weight * values, coc)``.
     """
-    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, weight), weight, labels)
-
+    counted = weight
+    if labels is not None and weight is None:  # pixels of a part of a picture, of which many are not there
+        counted = (values.detach() != 0).any(1, keepdim=True).to(values.dtype)
+    levels = merge_cells(values, coc, level_shares(values, coc, merging, highest, counted), weight, labels)
     pictures = []
     for level, cells in enumerate(levels):
         maps = [F.pad(t, (MARGIN if level else 0,) * 4) for t in cells]

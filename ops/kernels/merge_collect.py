@@ -225,32 +225,25 @@ def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-
 
 @nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
-    """For rows ``y0 .. y1-1``: ``sums (H, C+1)`` of weight times magnitude, and of the weight of what is not zero."""
+    """For rows ``y0 .. y1-1``: ``sums (H, C+1)`` of weight times magnitude, and of the weight."""
     channels, _, width = values.shape
-    alive = np.empty(width, np.float32)
+    counted = np.ones(width, np.float32)
     for y in range(y0, y1):
-        alive[:] = 0.0
-        for k in range(channels):
-            plane = values[k, y]
-            for x in range(width):
-                alive[x] = alive[x] if plane[x] == 0.0 else np.float32(1.0)
         if weight.shape[0] > 0:
-            row = weight[y]
-            for x in range(width):
-                alive[x] *= row[x]
+            counted[:] = weight[y]
         for k in range(channels):
             plane, total = values[k, y], np.float32(0.0)
             for x in range(width):
-                total += abs(plane[x]) * alive[x] if alive[x] > 0.0 else np.float32(0.0)
+                total += abs(plane[x]) * counted[x] if counted[x] > 0.0 else np.float32(0.0)
             sums[y, k] = total
         count = np.float32(0.0)
         for x in range(width):
-            count += alive[x]
+            count += counted[x]
         sums[y, channels] = count
 
 
 def channel_means(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Mean magnitude ``(C,)`` of every channel, over the pixels that hold anything: highlights are far above it."""
+    """Mean magnitude ``(C,)`` of every channel, by the weight of its pixels: highlights are far above it."""
     sums = np.empty((values.shape[1], len(values) + 1))
     run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
     *totals, count = sums.sum(0)

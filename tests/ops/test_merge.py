@@ -201,12 +201,16 @@ def test_a_highlight_is_bright_for_its_own_picture_and_channel() -> None:
     assert lowest.nonzero().tolist() == [[0, 0, 5, 6]]
 
 
-def test_the_mean_is_that_of_pixels_that_hold_anything() -> None:
+def test_the_mean_is_that_of_all_pixels_by_their_weight() -> None:
     values, coc = torch.zeros(1, 2, 64, 64, dtype=F64), torch.full((1, 1, 64, 64), 12.0, dtype=F64)
-    values[..., :8, :8] = 1  # against a mean over all pixels, everything would be a highlight
-    assert level_shares(values, coc, MIDDLE, 1)[0].max() == 0
-    values[:, 0, 3, 4] = 100
+    values[:, 0, 3, 4] = 1e-3  # a light before black is a highlight, as it is before any other dark ground
     assert level_shares(values, coc, MIDDLE, 1)[0].nonzero().tolist() == [[0, 0, 3, 4]]
+    values[..., :8, :8] = 1
+    here = torch.zeros_like(coc)
+    here[..., :8, :8] = 1  # pixels without weight are not there, and are no ground
+    assert level_shares(values, coc, MIDDLE, 1, here)[0].max() == 0
+    values[:, 0, 3, 4] = 100
+    assert level_shares(values, coc, MIDDLE, 1, here)[0].nonzero().tolist() == [[0, 0, 3, 4]]
     # Weight makes it usual, or leaves it alone with nothing to be compared with.
     weight = torch.ones_like(coc)
     weight[..., 3, 4] = 1e5

@@ -398,12 +398,12 @@ def test_highlights_are_noted_and_rows_know_their_reach() -> None:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_the_mean_is_that_of_pixels_that_hold_anything(weighted: bool) -> None:
+def test_black_pixels_count_in_the_mean(weighted: bool) -> None:
     values, coc = scene(1, 3, 100, 70)
     values[..., 20:90, :] = 0
     values[:, 1] = 0
     weight = weights(coc) if weighted else None
-    counted = (values != 0).any(1, keepdim=True) * (1.0 if weight is None else weight)
+    counted = torch.ones_like(coc) if weight is None else weight
     want = (values * counted).sum((0, 2, 3)) / counted.sum()
     np.testing.assert_allclose(collected(values, coc, 2, weight=weight).thresholds.means, want, rtol=1e-5)
 
