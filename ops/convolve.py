@@ -1,12 +1,11 @@
 """One point-spread function for the whole picture: a single convolution."""
 
 import math
-from numbers import Real
 
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.checks import check_image
+from torchbokeh.ops.checks import check_image, check_number
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.spans import Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
@@ -81,9 +80,7 @@ def blur_uniform(values: Tensor, radius: float, profile: Profile) -> Tensor:
     """
     check_image("values", values, ("B", "C", "H", "W"))
     check_profile(profile, values)
-    if not isinstance(radius, Real) or isinstance(radius, bool):
-        raise TypeError(f"radius: expected a number, got {radius!r}")
-    if not math.isfinite(radius):
+    if not math.isfinite(check_number("radius", radius)):
         raise ValueError(f"radius: expected a finite number of px, got {radius}")
     if values.numel() == 0:
         return values.clone()

@@ -36,8 +36,7 @@ def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
         >>> round(dense_spans(dot, torch.full_like(dot, 3.0), Disc().profile()).sum().item(), 6)
         1.0
     """
-    check_image("values", values, ("B", "C", "H", "W"))
-    b, _, h, w = values.shape
+    b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_profile(profile, values)
     values = values.double()
@@ -88,8 +87,7 @@ def dense_points(
         >>> dense_points(torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=torch.int64), table, pad=1)[0, 0, 1]
         tensor([0.0000, 0.5000, 0.5000], dtype=torch.float64)
     """
-    check_image("values", values, ("B", "C", "H", "W"))
-    b, c, h, w = values.shape
+    b, c, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("index", index, (b, 1, h, w), like=values, integer=True)
     check_kind("table", table, PointTable)
     check_whole("pad", pad, 0, 1 << 12)

@@ -238,8 +238,7 @@ def splat_merged(
         >>> out.shape, round(out[:, :3].min().item(), 5), round(out[:, :3].max().item(), 5)
         (torch.Size([1, 4, 64, 64]), 0.5, 0.5)
     """
-    check_image("values", values, ("B", "C", "H", "W"))
-    b, _, h, w = values.shape
+    b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_profile(profile, values)
     check_kind("merging", merging, Merging)

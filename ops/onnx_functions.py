@@ -1,8 +1,9 @@
 """What the operators of this package become in an exported ONNX file: standard operators only.
 
-`splat_rows` is a function of the file, a loop over the rows of the PSFs, as `torchbokeh.ops.splat` has it. Two things
-differ, since onnxruntime has no arc functions in double: the angle between the two ends of a slab is taken in float32,
-from its sine and cosine in double, so that it is exact to a relative 1e-7; and knots are found by halving.
+`splat_rows` and what it calls are functions of the file: a loop over the rows of the PSFs, as `torchbokeh.ops.splat`
+has it. Two things differ, since onnxruntime has no arc functions in double: the angle between the two ends of a slab is
+taken in float32, from its sine and cosine in double, so that it is exact to a relative 1e-7; and knots are found by
+halving.
 """
 
 # ruff: noqa: F821 (names of sizes)
@@ -20,6 +21,62 @@ LEVELS = 14
 
 
 @script(DOMAIN)
+def edge_integrals(
+    ends: DOUBLE["N"],
+    knots: DOUBLE["K", 3],
+    integrals: DOUBLE["K", 2],
+    slopes: DOUBLE["S", 2],
+    strides: INT64["T"],
+) -> DOUBLE["N", 2]:
+    """Integrals of the left and right edge up to the heights ``ends``; knots are found by halving, two need none."""
+    heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
+    last = op.Size(heights) - 2
+    found = op.Cast(op.CastLike(0.0, ends) * ends, to=INT64.dtype)
+    halvings = op.Size(strides)
+    for step in range(halvings):
+        further = op.Min(found + op.Gather(strides, step), last)
+        found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
+    beyond = op.Unsqueeze(ends - op.Gather(heights, found), [1])
+    edges = op.Slice(knots, [1], [3], [1])
+    edge = op.Gather(edges, found) + op.CastLike(0.5, ends) * op.Gather(slopes, found) * beyond
+    return op.Gather(integrals, found) + beyond * edge
+
+
+@script(DOMAIN)
+def arc_integral(u: DOUBLE["N"], v: DOUBLE["N"]) -> DOUBLE["N"]:
+    """Integral of ``sqrt(1 - x²)`` from u to v: the angle between is twice that whose tangent is sin / (1 + cos)."""
+    zero = op.CastLike(0.0, u)
+    half = op.CastLike(0.5, u)
+    one = op.CastLike(1.0, u)
+    at_u = op.Sqrt(op.Max(one - u * u, zero))
+    at_v = op.Sqrt(op.Max(one - v * v, zero))
+    sine = v * at_u - u * at_v
+    cosine = u * v + at_u * at_v
+    obtuse = op.Less(cosine, zero)
+    tiny = op.CastLike(1e-12, u)
+    tangent = op.Where(obtuse, one - cosine, sine) / op.Where(obtuse, op.Max(sine, tiny), one + cosine)
+    angle = op.CastLike(2.0, u) * op.Cast(op.Atan(op.Cast(tangent, to=FLOAT.dtype)), to=DOUBLE.dtype)
+    return half * (v * at_v - u * at_u + angle)
+
+
+@script(DOMAIN)
+def add_differences(
+    buffer: DOUBLE["C", "P"], base: INT64["N"], left: DOUBLE["N"], right: DOUBLE["N"], share: DOUBLE["C", "N"]
+) -> DOUBLE["C", "P"]:
+    """Add the two differences of each row that begins at ``base`` and runs from ``left`` to ``right``."""
+    left_column = op.Floor(left)
+    right_column = op.Floor(right)
+    left_index = base + op.Cast(left_column, to=INT64.dtype)
+    right_index = base + op.Cast(right_column, to=INT64.dtype)
+    left_next = share * (left - left_column)
+    right_next = share * (right - right_column)
+    index = op.Concat(left_index, left_index + 1, right_index, right_index + 1, axis=0)
+    update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=1)
+    # Not ScatterND: the threads of onnxruntime lose some of what it adds to one place.
+    return op.ScatterElements(buffer, op.Expand(index, op.Shape(update)), update, axis=1, reduction="add")
+
+
+@script(DOMAIN)
 def splat_rows(
     values: DOUBLE["B", "C", "H", "W"],
     coc: DOUBLE["B", 1, "H", "W"],
@@ -34,7 +91,6 @@ def splat_rows(
     zero = op.CastLike(0.0, coc)
     half = op.CastLike(0.5, coc)
     one = op.CastLike(1.0, coc)
-    two = op.CastLike(2.0, coc)
     tiny = op.CastLike(1e-12, coc)
     shape = op.Shape(values)
     channels = op.Slice(shape, [1], [2])
@@ -54,10 +110,6 @@ def splat_rows(
     top = op.Squeeze(op.Slice(knots, [-1, 0], [2147483647, 1]))
     middle = half * (top + bottom)
     extent = half * (top - bottom)
-    edges = op.Slice(knots, [1], [3], [1])
-    heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
-    last = op.Size(heights) - 2
-    halvings = op.Size(strides)
     cells = op.Div(count, width) * (width + 2)
     buffer = op.Expand(zero, op.Concat(channels, op.Reshape(cells, [1]), axis=0))
     for k in range(2 * reach + 1):
@@ -74,28 +126,10 @@ def splat_rows(
         high = op.Max(op.Min(op.Max(first, second), top), bottom)
         covered = high - low
         safe = op.Where(op.Greater(covered, tiny), covered, one)
-        # Integrals of the left and right edge up to both ends of the slab; knots are found by halving, two need none.
-        ends = op.Concat(low, high, axis=0)
-        found = op.Cast(zero * ends, to=INT64.dtype)
-        for step in range(halvings):
-            further = op.Min(found + op.Gather(strides, step), last)
-            found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
-        beyond = op.Unsqueeze(ends - op.Gather(heights, found), [1])
-        edge = op.Gather(edges, found) + half * op.Gather(slopes, found) * beyond
-        integral = op.Gather(integrals, found) + beyond * edge
+        integral = edge_integrals(op.Concat(low, high, axis=0), knots, integrals, slopes, strides)
         before, after = op.Split(integral, axis=0, num_outputs=2)
         straight = (after - before) / op.Unsqueeze(safe, [1])
-        # Integral of sqrt(1 - u²): the angle between the ends is twice that whose tangent is sin / (1 + cos).
-        u = (low - middle) / extent
-        v = (high - middle) / extent
-        at_u = op.Sqrt(op.Max(one - u * u, zero))
-        at_v = op.Sqrt(op.Max(one - v * v, zero))
-        sine = v * at_u - u * at_v
-        cosine = u * v + at_u * at_v
-        obtuse = op.Less(cosine, zero)
-        tangent = op.Where(obtuse, one - cosine, sine) / op.Where(obtuse, op.Max(sine, tiny), one + cosine)
-        angle = two * op.Cast(op.Atan(op.Cast(tangent, to=FLOAT.dtype)), to=DOUBLE.dtype)
-        arc = half * (v * at_v - u * at_u + angle)
+        arc = arc_integral((low - middle) / extent, (high - middle) / extent)
         round_part = bulge * extent * arc / safe
         left_edge = r * (op.Squeeze(op.Slice(straight, [0], [1], [1]), [1]) - round_part)
         right_edge = r * (op.Squeeze(op.Slice(straight, [1], [2], [1]), [1]) + round_part)
@@ -106,16 +140,7 @@ def splat_rows(
         wide = op.Cast(width, to=DOUBLE.dtype)  # here: outside, onnxruntime warns that it cannot optimise it away
         left = op.Max(op.Min(op.Min(left_edge, right_edge) + here, wide), zero)
         right = op.Max(op.Min(op.Max(left_edge, right_edge) + here, wide), zero)
-        left_column = op.Floor(left)
-        right_column = op.Floor(right)
-        left_index = base + op.Cast(left_column, to=INT64.dtype)
-        right_index = base + op.Cast(right_column, to=INT64.dtype)
-        left_next = share * (left - left_column)
-        right_next = share * (right - right_column)
-        index = op.Concat(left_index, left_index + 1, right_index, right_index + 1, axis=0)
-        update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=1)
-        # Not ScatterND: the threads of onnxruntime lose some of what it adds to one place.
-        buffer = op.ScatterElements(buffer, op.Expand(index, op.Shape(update)), update, axis=1, reduction="add")
+        buffer = add_differences(buffer, base, left, right, share)
     padded = op.Concat(channels, op.Slice(shape, [0], [1]), op.Reshape(height, [1]), op.Reshape(width + 2, [1]), axis=0)
     planes = op.Transpose(op.Reshape(buffer, padded), perm=[1, 0, 2, 3])
     return op.Slice(planes, [0], op.Reshape(width, [1]), [3])
@@ -192,4 +217,7 @@ def translations():
 
 def functions():
     """Functions of standard operators that an exported file has to hold."""
-    return [splat_rows.to_function_proto()]
+    made = [f.to_function_proto() for f in (edge_integrals, arc_integral, add_differences, splat_rows)]
+    own = onnx.helper.make_opsetid(DOMAIN.domain, DOMAIN.version)
+    made[-1].opset_import.append(own)  # onnxscript leaves it out, as the calls stand in a loop
+    return made

@@ -88,8 +88,7 @@ def splat_points(
                 [0.2500, 0.0000, 0.2500],
                 [0.0000, 0.2500, 0.0000]])
     """
-    check_image("values", values, ("B", "C", "H", "W"))
-    b, _, h, w = values.shape
+    b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("index", index, (b, 1, h, w), like=values, integer=True)
     check_kind("table", table, PointTable)
     check_image("table.offsets", table.offsets, ("P", 2), like=values)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_image, check_whole
-from torchbokeh.ops.spans import Profile, check_profile, edges_at
+from torchbokeh.ops.spans import Profile, check_profile, edges_at, heights_above
 
 MOST = 1 << 24
 """Points of a run of `halton`, and index of its first one, at most."""
@@ -82,13 +82,7 @@ def aperture_points(profile: Profile, square: Tensor) -> Tensor:
         across, along = u.sqrt() * (2 * torch.pi * v).cos(), u.sqrt() * (2 * torch.pi * v).sin()
         middle = torch.lerp(profile.knots[0, 1], profile.knots[1, 1], 0.5 + 0.5 * along)
         return torch.stack([middle + profile.bulge * across, torch.lerp(bottom, top, 0.5 + 0.5 * along)], 1)
-    heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
-    left, right = edges_at(profile, bottom + (top - bottom) * heights)
-    area = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
-    wanted = u * area[-1]
-    k = torch.searchsorted(area.detach(), wanted.detach(), right=True).clamp(1, len(area) - 1)
-    share = (wanted - area[k - 1]) / (area[k] - area[k - 1]).clamp_min(1e-30)
-    y = bottom + (top - bottom) * torch.lerp(heights[k - 1], heights[k], share)
+    y = bottom + (top - bottom) * heights_above(profile, u)
     left, right = edges_at(profile, y)
     return torch.stack([torch.lerp(left, right, v), y], 1)
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchbokeh.ops.spans import Profile, area, knot_integrals
+from torchbokeh.ops.spans import FLAT, Profile, area, edge_slopes, knot_integrals, piece_at
 
 
 def row_span_gradient(
@@ -36,10 +36,7 @@ def row_span_gradient(
     safe = torch.where(covered, height, 1.0)
 
     # At both ends: the edges (2, N, 2), their integrals, the semicircle and its integral.
-    rise = knots[1:, :1] - knots[:-1, :1]
-    steep = rise > 1e-9
-    slopes = torch.where(steep, (knots[1:, 1:] - knots[:-1, 1:]) / torch.where(steep, rise, 1.0), 0.0)
-    k = (torch.searchsorted(knots[:, 0].contiguous(), clamped, right=True) - 1).clamp(0, len(knots) - 2)
+    slopes, k = edge_slopes(knots), piece_at(knots, clamped)
     dy = (clamped - knots[k, 0])[..., None]
     edges = knots[k, 1:] + slopes[k] * dy
     integrals = knot_integrals(knots)[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
@@ -76,19 +73,32 @@ def row_span_gradient(
     by_bottom = (by_ends * (ends <= bottom)).sum() + 0.5 * (by_middle - by_half)
     by_top = (by_ends * (ends >= top)).sum() + 0.5 * (by_middle + by_half)
 
-    # To the knots: the integral up to y in piece k is `before[k] + dy * (edge[k] + slope[k] * dy / 2)`.
-    k, v, dy = k.reshape(-1), by_integral.reshape(-1, 2), dy.reshape(-1, 1)
+    by_knots = _knots_gradient(knots, (k, dy, edges), by_integral, by_area * side)
+    by_knots[0, 0] += by_bottom
+    by_knots[-1, 0] += by_top
+    return by_coc, by_knots, by_bulge
+
+
+def _knots_gradient(
+    knots: Tensor, ends: tuple[Tensor, Tensor, Tensor], by_integral: Tensor, by_whole: Tensor
+) -> Tensor:
+    """Gradient of the knots by way of the integrals of the edges: up to both ends ``(2, N, 2)``, and whole ``(2,)``.
+
+    The integral up to an end in piece k is ``before[k] + dy * (edge[k] + slope[k] * dy / 2)``. Of the ``ends``, these
+    are k and ``dy``, and the edges there.
+    """
+    k, v, dy, edges = ends[0].reshape(-1), by_integral.reshape(-1, 2), ends[1].reshape(-1, 1), ends[2].reshape(-1, 2)
+    rise, slopes = knots[1:, :1] - knots[:-1, :1], edge_slopes(knots)
+    steep = rise > FLAT
     by_before = torch.zeros_like(knots[:, 1:]).index_add_(0, k, v)
-    by_before[-1] += by_area * side
+    by_before[-1] += by_whole
     by_knots = torch.zeros_like(knots)
     by_knots[:, 1:].index_add_(0, k, v * dy)
-    by_knots[:, 0].index_add_(0, k, -(v * edges.reshape(-1, 2)).sum(1))
+    by_knots[:, 0].index_add_(0, k, -(v * edges).sum(1))
     by_slope = torch.zeros_like(slopes).index_add_(0, k, 0.5 * v * dy * dy)
     by_piece = by_before[1:].flip(0).cumsum(0).flip(0)
     by_run = torch.where(steep, by_slope / torch.where(steep, rise, 1.0), 0.0)
     by_rise = (0.5 * by_piece * (knots[1:, 1:] + knots[:-1, 1:]) - by_run * slopes).sum(1)
     by_knots[1:] += torch.cat([by_rise[:, None], 0.5 * by_piece * rise + by_run], 1)
     by_knots[:-1] += torch.cat([-by_rise[:, None], 0.5 * by_piece * rise - by_run], 1)
-    by_knots[0, 0] += by_bottom
-    by_knots[-1, 0] += by_top
-    return by_coc, by_knots, by_bulge
+    return by_knots

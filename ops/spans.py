@@ -65,11 +65,20 @@ class _Semicircle(torch.autograd.Function):
         return grad * (1 - t * t).clamp_min(0).sqrt()
 
 
-def _slopes(knots: Tensor) -> Tensor:
+FLAT = 1e-9
+"""Knots whose heights differ by no more are of equal height."""
+
+
+def edge_slopes(knots: Tensor) -> Tensor:
     """Slopes ``(K-1, 2)`` of the left and right edge between the knots; 0 between knots of equal height."""
     rise = knots[1:, :1] - knots[:-1, :1]
-    flat = rise <= 1e-9
+    flat = rise <= FLAT
     return torch.where(flat, 0.0, (knots[1:, 1:] - knots[:-1, 1:]) / torch.where(flat, 1.0, rise))
+
+
+def piece_at(knots: Tensor, y: Tensor) -> Tensor:
+    """The numbers of the knots that the heights ``y`` lie above, from 0 to K-2: of the pieces of the edges there."""
+    return (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
 
 
 def knot_integrals(knots: Tensor) -> Tensor:
@@ -107,10 +116,10 @@ def row_span(coc: Tensor, row: int, profile: Profile) -> tuple[Tensor, Tensor, T
     covered = height > 1e-12
     safe_height = torch.where(covered, height, 1.0)
 
-    integrals, slopes = knot_integrals(knots), _slopes(knots)
+    integrals, slopes = knot_integrals(knots), edge_slopes(knots)
 
     def edge_integrals(y: Tensor) -> Tensor:
-        k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
+        k = piece_at(knots, y)
         dy = (y - knots[k, 0])[:, None]
         return integrals[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
 
@@ -135,12 +144,24 @@ def clamp_radius(coc: Tensor) -> Tensor:
 def edges_at(profile: Profile, y: Tensor) -> tuple[Tensor, Tensor]:
     """Left and right edge of the unit shape at the heights ``y`` ``(N,)``, which lie between its knots."""
     knots, bulge = profile
-    k = (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
-    left, right = (knots[k, 1:] + _slopes(knots)[k] * (y - knots[k, 0])[:, None]).unbind(1)
+    k = piece_at(knots, y)
+    left, right = (knots[k, 1:] + edge_slopes(knots)[k] * (y - knots[k, 0])[:, None]).unbind(1)
     bottom, top = knots[0, 0], knots[-1, 0]
     t = (2 * y - bottom - top) / (top - bottom)
     arc = bulge * (1 - t * t).clamp_min(1e-30).sqrt()
     return left - arc, right + arc
+
+
+def heights_above(profile: Profile, parts: Tensor, of: int = 1) -> Tensor:
+    """Where ``(N,)`` in the height of the unit shape, from 0 to 1, so many ``parts (N,)`` ``of`` its area end."""
+    bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
+    heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
+    left, right = edges_at(profile, bottom + (top - bottom) * heights)
+    below = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
+    wanted = below[-1] * parts / of
+    k = torch.searchsorted(below.detach(), wanted.detach(), right=True).clamp(1, len(below) - 1)
+    part = (wanted - below[k - 1]) / (below[k] - below[k - 1]).clamp_min(1e-30)
+    return torch.lerp(heights[k - 1], heights[k], part)
 
 
 def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
@@ -167,17 +188,12 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
     if side == 1:
         return [profile]
     bottom, top = profile.knots[0, 0], profile.knots[-1, 0]
-    heights = torch.linspace(0, 1, 4097, dtype=profile.knots.dtype, device=profile.knots.device)
-    left, right = edges_at(profile, bottom + (top - bottom) * heights)
-    share = torch.cat([heights[:1], torch.cumulative_trapezoid(right - left, heights)])
-    wanted = share[-1] * torch.arange(1, side, dtype=share.dtype, device=share.device) / side
-    k = torch.searchsorted(share.detach(), wanted.detach())
-    part = (wanted - share[k - 1]) / (share[k] - share[k - 1])
-    cuts = torch.cat([heights[:1], torch.lerp(heights[k - 1], heights[k], part), heights[-1:]])
+    inner_cuts = heights_above(profile, torch.arange(1, side).to(profile.knots), side)
+    cuts = torch.cat([bottom.new_zeros(1), inner_cuts, bottom.new_ones(1)])
     pieces = []
     for start, stop in pairwise(cuts):
         # Knots crowd towards the ends, as the edge of a disc turns there.
-        t = 0.5 - 0.5 * torch.linspace(0, torch.pi, samples, dtype=heights.dtype, device=heights.device).cos()
+        t = 0.5 - 0.5 * torch.linspace(0, torch.pi, samples, dtype=cuts.dtype, device=cuts.device).cos()
         y = bottom + (top - bottom) * (start + (stop - start) * t)
         inner = profile.knots[1:-1, 0]
         y = torch.cat([y, inner[(inner > y[0]) & (inner < y[-1])]])

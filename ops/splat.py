@@ -56,8 +56,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
         >>> round(disc.sum().item(), 4)
         1.0
     """
-    check_image("values", values, ("B", "C", "H", "W"))
-    b, _, h, w = values.shape
+    b, _, h, w = check_image("values", values, ("B", "C", "H", "W")).shape
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_profile(profile, values)
     check_flag("integrate", integrate)

@@ -141,83 +141,91 @@ def _add(cells, p, lanes, w, r, signed):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def _collect_row(picture, lanes, levels, y, starts, row, farthest, marks):  # type: ignore[no-untyped-def]
+    """Sum the pixels of row ``y`` into the cells of their levels, whose rows begin at ``starts (L+1,)``.
+
+    ``row`` is scratch of `classify`. ``farthest (L+1,)`` takes the largest radius of each level, and ``marks (W,)`` the
+    flat indices of the highlights, whose number is returned. Sums are kept in registers as long as neighbours go to
+    the same cell.
+    """
+    values, coc, weight = picture
+    cells, (numbers, shares) = levels.cells, row
+    c0, c1, c2, c3 = lanes.channel[0], lanes.channel[1], lanes.channel[2], lanes.channel[3]
+    a, b, c, d = lanes.constant[0], lanes.constant[1], lanes.constant[2], lanes.constant[3]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    weighted, width = weight.shape[0] > 0, coc.shape[1]
+    begin, end = classify(picture, levels.thresholds, y, numbers, shares)
+    count, current = 0, -1
+    s0 = s1 = s2 = s3 = sw = sr = ss = zero
+    for x in range(begin, end):
+        level = int(numbers[x])
+        signed = coc[y, x]
+        r = abs(signed)
+        if level <= 0:
+            if level == 0:
+                farthest[0] = max(farthest[0], r)
+            elif level == -1:
+                marks[count] = y * width + x
+                count += 1
+            continue
+        if c0 >= 0:
+            a = values[c0, y, x]
+        if c1 >= 0:
+            b = values[c1, y, x]
+        if c2 >= 0:
+            c = values[c2, y, x]
+        if c3 >= 0:
+            d = values[c3, y, x]
+        p = RECORD * (starts[level] + (x >> level))
+        if p != current:
+            if current >= 0:
+                _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
+            current = p
+            s0 = s1 = s2 = s3 = sw = sr = ss = zero
+        whole = weight[y, x] if weighted else one
+        w = shares[x] * whole
+        s0 += w * a
+        s1 += w * b
+        s2 += w * c
+        s3 += w * d
+        sw += w
+        sr += w * r
+        ss += w * signed
+        farthest[level] = max(farthest[level], r)
+        if shares[x] < one:
+            level -= 1
+            farthest[level] = max(farthest[level], r)
+            if level > 0:
+                w = whole - w
+                p = RECORD * (starts[level] + (x >> level))
+                _add(cells, p, (w * a, w * b, w * c, w * d), w, w * r, w * signed)
+    if current >= 0:
+        _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
+    return count
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
     """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
 
-    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are. One long
-    function: sums are kept in registers as long as neighbours go to the same cell.
+    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
     """
-    values, coc, weight = picture
-    thresholds, sizes, cells, reach, _ = levels
-    highest, width = thresholds.highest, coc.shape[1]
+    sizes, cells, reach = levels.sizes, levels.cells, levels.reach
+    highest, width = levels.thresholds.highest, picture.coc.shape[1]
     for level in range(1, highest + 1):
         columns, start = sizes[level, 1], sizes[level, 2]
         first, last = y0 >> level, (y1 - 1) >> level
         cells[RECORD * (start + first * columns) : RECORD * (start + (last + 1) * columns)] = 0.0
         reach[level, first : last + 1] = 0.0
-    channel, constant = lanes.channel, lanes.constant
-    c0, c1, c2, c3 = channel[0], channel[1], channel[2], channel[3]
-    a, b, c, d = constant[0], constant[1], constant[2], constant[3]
-    zero, one = np.float32(0.0), np.float32(1.0)
-    weighted = weight.shape[0] > 0
-    numbers, shares = np.empty(width, np.float32), np.empty(width, np.float32)
+    row = np.empty(width, np.float32), np.empty(width, np.float32)
     farthest = np.zeros(highest + 1, np.float32)
     starts = np.empty(highest + 1, np.int64)
     for y in range(y0, y1):
-        count = 0
-        begin, end = classify(picture, thresholds, y, numbers, shares)
         for level in range(1, highest + 1):
             starts[level] = sizes[level, 2] + (y >> level) * sizes[level, 1]
         farthest[:] = 0.0
         farthest[0] = -1.0
-        # The sums of the cell that the last pixel went to: neighbours mostly go to the same one.
-        current = -1
-        s0 = s1 = s2 = s3 = sw = sr = ss = zero
-        for x in range(begin, end):
-            level = int(numbers[x])
-            signed = coc[y, x]
-            r = abs(signed)
-            if level <= 0:
-                if level == 0:
-                    farthest[0] = max(farthest[0], r)
-                elif level == -1:
-                    marks[y, count] = y * width + x
-                    count += 1
-                continue
-            if c0 >= 0:
-                a = values[c0, y, x]
-            if c1 >= 0:
-                b = values[c1, y, x]
-            if c2 >= 0:
-                c = values[c2, y, x]
-            if c3 >= 0:
-                d = values[c3, y, x]
-            p = RECORD * (starts[level] + (x >> level))
-            if p != current:
-                if current >= 0:
-                    _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
-                current = p
-                s0 = s1 = s2 = s3 = sw = sr = ss = zero
-            whole = weight[y, x] if weighted else one
-            w = shares[x] * whole
-            s0 += w * a
-            s1 += w * b
-            s2 += w * c
-            s3 += w * d
-            sw += w
-            sr += w * r
-            ss += w * signed
-            farthest[level] = max(farthest[level], r)
-            if shares[x] < one:
-                level -= 1
-                farthest[level] = max(farthest[level], r)
-                if level > 0:
-                    w = whole - w
-                    p = RECORD * (starts[level] + (x >> level))
-                    _add(cells, p, (w * a, w * b, w * c, w * d), w, w * r, w * signed)
-        if current >= 0:
-            _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
-        counts[y] = count
+        counts[y] = _collect_row(picture, lanes, levels, y, starts, row, farthest, marks[y])
         reach[0, y] = farthest[0]
         for level in range(1, highest + 1):
             reach[level, y >> level] = max(reach[level, y >> level], farthest[level])

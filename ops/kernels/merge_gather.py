@@ -153,12 +153,21 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
             grads[p + 4] = slope * (scale * (cells[p + 5] / cells[p + 4]) / smaller) * scale / cells[p + 4]
 
 
+@nb.njit(inline="always")
+def _lowest_share(level, share):  # type: ignore[no-untyped-def]
+    """What a pixel has on the lowest level, from what `classify` says of it."""
+    if level == 1:
+        return np.float32(1.0) - share
+    return np.float32(1.0 if level == 0 or level == -1 else 0.0)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: ignore[no-untyped-def]
     """Gradients of rows ``y0 .. y1-1`` of the picture: from its lowest level and from its cells.
 
     ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the lowest level, and the cells of ``levels``
-    hold their own gradients. One long function: numba counts references to arrays that are handed on for each pixel.
+    hold their own gradients. Only numbers are handed on within
+    the loop: numba counts references to arrays that are, for each pixel.
     """
     values, coc, weight = picture
     grad_values, grad_coc, grad_weight = grads
@@ -179,20 +188,13 @@ def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: 
             signed = np.float64(coc[y, x])
             whole = weight[y, x] if weight.shape[0] > 0 else np.float32(1.0)
             grad[:] = 0.0
-            if level == -2:
-                lowest = np.float32(0.0)
-            elif level <= 0:
-                lowest = np.float32(1.0)
-            else:
-                lowest = np.float32(1.0) - share if level == 1 else np.float32(0.0)
-                for part in range(2):
-                    here = level - part
-                    w = np.float32(1.0) - share if part else share
-                    if here > 0 and w > 0.0:
-                        p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
-                        for k in range(4):
-                            grad[k] += w * cells[p + k]
-                        grad[4] += w * whole * cells[p + 4]
+            for here, w in ((level, share), (level - 1, np.float32(1.0) - share)):
+                if here > 0 and w > 0.0:
+                    p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
+                    for k in range(4):
+                        grad[k] += w * cells[p + k]
+                    grad[4] += w * whole * cells[p + 4]
+            lowest = _lowest_share(level, share)
             if lowest > 0.0:
                 radius = np.rint(bank_steps * abs(signed))
                 if radius < in_bank:

@@ -51,6 +51,42 @@ class Views(NamedTuple):
     columns: np.ndarray
 
 
+class Row(NamedTuple):
+    """Scratch for a row of ``W`` pixels and K rectangles.
+
+    Attributes:
+        lines: ``(K, 6)``: of ``s / z``, ``t / z`` and ``1 / z`` the value in the first pixel and the step to the next.
+        begin: ``(K,)``, the first pixel that meets each rectangle.
+        end: ``(K,)``, one past the last.
+        met: ``(K,)``, the rectangles that the row meets, roughly by depth.
+        cuts: ``(W + 1,)``, whether a rectangle begins or ends there.
+        active: ``(K,)``, the rectangles that a part of the row meets, nearest first.
+        depths: ``(K,)`` ``1 / z`` of each in a pixel.
+        rgba: ``(4,)``, what is seen of one.
+        total: ``(4,)``, what is seen of all.
+    """
+
+    lines: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    met: np.ndarray
+    cuts: np.ndarray
+    active: np.ndarray
+    depths: np.ndarray
+    rgba: np.ndarray
+    total: np.ndarray
+
+
+class Copies(NamedTuple):
+    """What several views share: for each a strip of BAND rows, flat from its place in ``starts (N + 1,)`` on, of
+    ``rgba (P, 4)``, and whether each pixel is ``filled (P,)``.
+    """
+
+    starts: np.ndarray
+    rgba: np.ndarray
+    filled: np.ndarray
+
+
 # Only functions of numbers are inlined: numba counts references to arrays at each inlined call, with atomic
 # operations that take longer than the work itself.
 
@@ -90,148 +126,196 @@ def _sort(active, count, depths):  # type: ignore[no-untyped-def]
         active[b] = k
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _render_band(textures, shown, each, out, nearest, y0, y1):  # type: ignore[no-untyped-def]
-    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``.
+@nb.njit(inline="always")
+def _texel(s, scale, size, rim):  # type: ignore[no-untyped-def]
+    """Which texel of a level of that size, counted from its rim, a coordinate lies behind, and the share of the next.
 
-    One long function: to hand arrays on within its loops would take longer than the work itself, see above.
+    ``scale`` is the size of a texel of level 0 in the level; the coordinate may lie ``rim`` outside.
+    """
+    s = min(max(s * scale - 0.5, -rim), size - 1.0 + 0.999999 * rim) + 1.0
+    i = int(s)  # not negative: the floor
+    return i, np.float32(s - i)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _meet(textures, shown, v, y, row):  # type: ignore[no-untyped-def]
+    """Fill ``row`` with the rectangles that row ``y`` of view ``v`` meets, and return how many they are."""
+    sizes, mirror = textures.sizes, textures.mirror
+    inverse, level, order = shown.inverse[v], shown.level[v], shown.order[v]
+    lines, begin, end, met, cuts = row.lines, row.begin, row.end, row.met, row.cuts
+    centre, width = y + 0.5, len(cuts) - 1
+    found = 0
+    cuts[:] = False
+    for k in order:
+        for c in range(3):
+            # The value at x = 0.5, the centre of the first pixel, and the step from pixel to pixel.
+            step = inverse[k, c, 0]
+            lines[k, 2 * c] = inverse[k, c, 1] * centre + inverse[k, c, 2] + 0.5 * step
+            lines[k, 2 * c + 1] = step
+        start, slope = lines[k, 4], lines[k, 5]
+        low, high = _cut(start, slope, -1.0, float(width))
+        if not mirror[k]:
+            lod = level[k]
+            rim = 0.5 * (1 << lod)
+            for c in range(2):
+                a, b = lines[k, 2 * c], lines[k, 2 * c + 1]
+                low, high = _cut(a + rim * start, b + rim * slope, low, high)
+                far = float(sizes[k, lod, c] << lod) + rim  # a level of odd size may end beyond level 0
+                low, high = _cut(far * start - a, far * slope - b, low, high)
+                if low >= high:
+                    break
+        if low < high:
+            begin[k] = max(math.floor(low) + 1, 0)
+            end[k] = min(math.ceil(high), width)
+            if begin[k] < end[k]:
+                met[found] = k
+                found += 1
+                cuts[begin[k]] = True
+                cuts[end[k]] = True
+    return found
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _measure(row, infinite, x, count):  # type: ignore[no-untyped-def]
+    """The depths of the active rectangles in column ``x``."""
+    lines, active, depths = row.lines, row.active, row.depths
+    for m in range(count):
+        k = active[m]
+        depths[k] = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * x
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _activate(row, infinite, found, start, stop):  # type: ignore[no-untyped-def]
+    """Sort the rectangles that the columns ``start .. stop-1`` meet by their depth in the first of them.
+
+    Returns how many they are, and whether their order is the same in all of these columns.
+    """
+    begin, end, met, active, depths = row.begin, row.end, row.met, row.active, row.depths
+    count = 0
+    for m in range(found):
+        k = met[m]
+        if begin[k] <= start and end[k] >= stop:
+            active[count] = k
+            count += 1
+    _measure(row, infinite, start, count)
+    _sort(active, count, depths)
+    _measure(row, infinite, stop - 1, count)
+    settled = True
+    for m in range(1, count):
+        k, other = active[m], active[m - 1]
+        if depths[other] < depths[k] or (depths[other] == depths[k] and other > k):
+            settled = False
+    return count, settled
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _render_part(textures, shown, place, row, part, copies, out, nearest):  # type: ignore[no-untyped-def]
+    """Render the columns ``start .. stop-1`` of a row of a view, all of which meet the same rectangles.
+
+    ``place`` is the view and the row of the band, ``part`` are the columns and what `_activate` returns. Adds to
+    ``out (W, 4)``, and writes to ``nearest (W,)`` unless it is empty. The one loop is not cut into functions that take
+    arrays: handing these on would take longer than the work itself, see above.
     """
     texels, first, sizes, full, mirror, infinite = textures
-    inverse, level, order, copy, columns = shown
-    views, count = level.shape
-    width = out.shape[2]
-    begin = np.empty(count, np.int64)
-    end = np.empty(count, np.int64)
-    lines = np.empty((count, 6), np.float64)
-    depths = np.empty(count, np.float64)
-    met = np.empty(count, np.int64)
-    active = np.empty(count, np.int64)
-    cuts = np.zeros(width + 1, np.bool_)
-    rgba = np.empty(4, np.float32)
-    total = np.empty(4, np.float32)
-    # Copies of what several views share: a strip of BAND rows for each, its columns `columns[c, 0]` and on.
+    (v, strip), (start, stop, count, settled) = place, part
+    level, copy, columns = shown.level[v], shown.copy[v], shown.columns
+    lines, active, rgba, total = row.lines, row.active, row.rgba, row.total
+    each = len(nearest) > 0
+    for x in range(start, stop):
+        if not settled:
+            _measure(row, infinite, x, count)
+            _sort(active, count, row.depths)
+        left, most, seen = np.float32(1.0), np.float32(0.0), 0.0
+        for c in range(4):
+            total[c] = 0.0
+        for m in range(count):
+            k = active[m]
+            kept, p = copy[k], 0
+            if kept >= 0:
+                p = copies.starts[kept] + strip * columns[kept, 1] + x - columns[kept, 0]
+            if kept >= 0 and copies.filled[p]:
+                for c in range(4):
+                    rgba[c] = copies.rgba[p, c]
+            else:
+                z = lines[k, 4] + lines[k, 5] * x
+                scale = 1.0 / z
+                s = (lines[k, 0] + lines[k, 1] * x) * scale
+                t = (lines[k, 2] + lines[k, 3] * x) * scale
+                # Rounding at the end of an interval; NaN fails too.
+                if not (z > 0.0 and abs(s) < 1e15 and abs(t) < 1e15):
+                    continue
+                lod, rim = level[k], 1.0
+                if mirror[k]:
+                    s, t, rim = _reflected(s, full[k, 0]), _reflected(t, full[k, 1]), 0.0
+                i, f = _texel(s, 1.0 / (1 << lod), sizes[k, lod, 0], rim)
+                j, g = _texel(t, 1.0 / (1 << lod), sizes[k, lod, 1], rim)
+                stride = sizes[k, lod, 0] + 2
+                upper = 4 * (first[k, lod] + j * stride + i)
+                lower = upper + 4 * stride
+                for c in range(4):
+                    top = texels[upper + c] + f * (texels[upper + 4 + c] - texels[upper + c])
+                    bottom = texels[lower + c] + f * (texels[lower + 4 + c] - texels[lower + c])
+                    rgba[c] = top + g * (bottom - top)
+                if kept >= 0:
+                    copies.filled[p] = True
+                    for c in range(4):
+                        copies.rgba[p, c] = rgba[c]
+            for c in range(4):
+                total[c] += left * rgba[c]
+            if each and left * rgba[3] > most:
+                most = left * rgba[3]
+                seen = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * x
+            left *= np.float32(1.0) - rgba[3]
+            if left < SOLID:
+                break
+        for c in range(4):
+            out[x, c] += total[c]
+        if each:
+            nearest[x] = seen if most > left else 0.0
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _scratch(count, width):  # type: ignore[no-untyped-def]
+    lines, depths, cuts = np.empty((count, 6), np.float64), np.empty(count, np.float64), np.zeros(width + 1, np.bool_)
+    places = np.empty((4, count), np.int64)
+    return Row(
+        lines,
+        places[0],
+        places[1],
+        places[2],
+        cuts,
+        places[3],
+        depths,
+        np.empty(4, np.float32),
+        np.empty(4, np.float32),
+    )
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _render_band(textures, shown, each, out, nearest, y0, y1):  # type: ignore[no-untyped-def]
+    """Render rows ``y0 .. y1`` of every view; add to ``out[0]``, or write to ``out[v]`` and ``nearest[v]``."""
+    views, rectangles = shown.level.shape
+    columns, width = shown.columns, out.shape[2]
+    row, nowhere = _scratch(rectangles, width), np.empty(0, np.float32)
     starts = np.zeros(len(columns) + 1, np.int64)
     for c in range(len(columns)):
         starts[c + 1] = starts[c] + columns[c, 1] * (y1 - y0)
-    copies = np.empty((starts[-1], 4), np.float32)
-    filled = np.zeros(starts[-1], np.bool_)
+    copies = Copies(starts, np.empty((starts[-1], 4), np.float32), np.zeros(starts[-1], np.bool_))
+    cuts = row.cuts
     for v in range(views):
         slot = v if each else 0
         for y in range(y0, y1):
-            centre = y + 0.5
-            found = 0
-            cuts[:] = False
-            for m in range(count):
-                k = order[v, m]
-                for c in range(3):
-                    # The value at x = 0.5, the centre of the first pixel, and the step from pixel to pixel.
-                    step = inverse[v, k, c, 0]
-                    lines[k, 2 * c] = inverse[v, k, c, 1] * centre + inverse[v, k, c, 2] + 0.5 * step
-                    lines[k, 2 * c + 1] = step
-                start, slope = lines[k, 4], lines[k, 5]
-                low, high = _cut(start, slope, -1.0, float(width))
-                if not mirror[k]:
-                    lod = level[v, k]
-                    rim = 0.5 * (1 << lod)
-                    for c in range(2):
-                        a, b = lines[k, 2 * c], lines[k, 2 * c + 1]
-                        low, high = _cut(a + rim * start, b + rim * slope, low, high)
-                        far = float(sizes[k, lod, c] << lod) + rim  # a level of odd size may end beyond level 0
-                        low, high = _cut(far * start - a, far * slope - b, low, high)
-                        if low >= high:
-                            break
-                if low < high:
-                    begin[k] = max(math.floor(low) + 1, 0)
-                    end[k] = min(math.ceil(high), width)
-                    if begin[k] < end[k]:
-                        met[found] = k
-                        found += 1
-                        cuts[begin[k]] = True
-                        cuts[end[k]] = True
-            left_end = 0
-            while left_end < width:
-                right_end = left_end + 1
-                while right_end < width and not cuts[right_end]:
-                    right_end += 1
-                n = 0
-                for m in range(found):
-                    k = met[m]
-                    if begin[k] <= left_end and end[k] >= right_end:
-                        active[n] = k
-                        n += 1
-                        depths[k] = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * left_end
-                _sort(active, n, depths)
-                for m in range(n):
-                    k = active[m]
-                    depths[k] = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * (right_end - 1)
-                settled = True
-                for m in range(1, n):
-                    k, other = active[m], active[m - 1]
-                    if depths[other] < depths[k] or (depths[other] == depths[k] and other > k):
-                        settled = False
-                for x in range(left_end, right_end):
-                    if not settled:
-                        for m in range(n):
-                            k = active[m]
-                            depths[k] = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * x
-                        _sort(active, n, depths)
-                    left = np.float32(1.0)
-                    most = np.float32(0.0)
-                    seen = 0.0
-                    for c in range(4):
-                        total[c] = 0.0
-                    for m in range(n):
-                        k = active[m]
-                        kept = copy[v, k]
-                        place = 0
-                        if kept >= 0:
-                            place = starts[kept] + (y - y0) * columns[kept, 1] + x - columns[kept, 0]
-                        if kept >= 0 and filled[place]:
-                            for c in range(4):
-                                rgba[c] = copies[place, c]
-                        else:
-                            z = lines[k, 4] + lines[k, 5] * x
-                            scale = 1.0 / z
-                            s = (lines[k, 0] + lines[k, 1] * x) * scale
-                            t = (lines[k, 2] + lines[k, 3] * x) * scale
-                            # Rounding at the end of an interval; NaN fails too.
-                            if not (z > 0.0 and abs(s) < 1e15 and abs(t) < 1e15):
-                                continue
-                            lod = level[v, k]
-                            tall, wide = sizes[k, lod, 1], sizes[k, lod, 0]
-                            scale = 1.0 / (1 << lod)
-                            rim = 1.0
-                            if mirror[k]:
-                                rim = 0.0
-                                s = _reflected(s, full[k, 0])
-                                t = _reflected(t, full[k, 1])
-                            s = min(max(s * scale - 0.5, -rim), wide - 1.0 + 0.999999 * rim) + 1.0
-                            t = min(max(t * scale - 0.5, -rim), tall - 1.0 + 0.999999 * rim) + 1.0
-                            i, j = int(s), int(t)  # not negative: the floor
-                            p = 4 * (first[k, lod] + j * (wide + 2) + i)
-                            q = p + 4 * (wide + 2)
-                            f, g = np.float32(s - i), np.float32(t - j)
-                            for c in range(4):
-                                top = texels[p + c] + f * (texels[p + 4 + c] - texels[p + c])
-                                bottom = texels[q + c] + f * (texels[q + 4 + c] - texels[q + c])
-                                rgba[c] = top + g * (bottom - top)
-                            if kept >= 0:
-                                filled[place] = True
-                                for c in range(4):
-                                    copies[place, c] = rgba[c]
-                        for c in range(4):
-                            total[c] += left * rgba[c]
-                        if each and left * rgba[3] > most:
-                            most = left * rgba[3]
-                            seen = 0.0 if infinite[k] else lines[k, 4] + lines[k, 5] * x
-                        left *= np.float32(1.0) - rgba[3]
-                        if left < SOLID:
-                            break
-                    for c in range(4):
-                        out[slot, y, x, c] += total[c]
-                    if each:
-                        nearest[slot, y, x] = seen if most > left else 0.0
-                left_end = right_end
+            found = _meet(textures, shown, v, y, row)
+            target, depth = out[slot, y], nearest[slot, y] if each else nowhere
+            start = 0
+            while start < width:
+                stop = start + 1
+                while stop < width and not cuts[stop]:
+                    stop += 1
+                count, settled = _activate(row, textures.infinite, found, start, stop)
+                part = start, stop, count, settled
+                _render_part(textures, shown, (v, y - y0), row, part, copies, target, depth)
+                start = stop
 
 
 def render_planes(

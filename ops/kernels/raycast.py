@@ -101,12 +101,64 @@ def _bounds_band(low, high, extent, reach, iterations, y0, y1, bounds):  # type:
             bounds[0, y, x], bounds[1, y, x] = a, z
 
 
+@nb.njit(inline="always")
+def _pace(ux, uy, w, h):  # type: ignore[no-untyped-def]
+    """Whether the rays of a view step along x, pixels per CoC and CoC per pixel, and the CoC that leads to the border.
+
+    Shifts by more than the picture are all the same: everything is beyond the border.
+    """
+    along_x = abs(ux) >= abs(uy)
+    scale, length = (abs(ux), w) if along_x else (abs(uy), h)
+    return along_x, scale, 1.0 / scale, length / scale
+
+
+@nb.njit(inline="always")
+def _corners(u, v):  # type: ignore[no-untyped-def]
+    """Weights of four pixels for a place that lies ``(u, v)`` from the first one."""
+    return (1.0 - v) * (1.0 - u), (1.0 - v) * u, v * (1.0 - u), v * u
+
+
+@nb.njit(inline="always")
+def _of_one(a, b, c, d):  # type: ignore[no-untyped-def]
+    """Weights divided by their sum; without any, that of the first pixel.
+
+    They add up to 1 but for 1e-16, which no float32 keeps: a constant picture stays constant.
+    """
+    weight = a + b + c + d
+    a, inverse = (a, 1.0 / weight) if weight > 0.0 else (1.0, 1.0)
+    return a * inverse, b * inverse, c * inverse, d * inverse
+
+
+@nb.njit(inline="always")
+def _between(a, b, share, step):  # type: ignore[no-untyped-def]
+    """`raycast._sample`: the height field between two pixels, or that of the nearest if they are two surfaces."""
+    nearest = a if share < 0.5 else b
+    return a + (b - a) * share if abs(a - b) <= step else nearest
+
+
+@nb.njit(inline="always")
+def _hit(j, px, scale, step, before, after, in_front, ahead):  # type: ignore[no-untyped-def]
+    """`raycast._cast`: the CoC at which a ray hits the field between the samples ``j-1`` and ``j``, NaN for nowhere.
+
+    The field is ``before`` and ``after`` there, and the ray ``in_front`` and ``ahead`` of it.
+    """
+    if abs(after - before) <= step:
+        if (ahead <= 0.0) if in_front >= 0.0 else (ahead >= 0.0):
+            share = in_front / (in_front - ahead) if in_front != ahead else 0.0
+            return (j - 1 + share) * px
+    elif in_front >= 0.0 and in_front * scale <= 0.5:
+        return before
+    elif ahead <= 0.0 and ahead * scale >= -0.5:
+        return after
+    return np.nan
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
     """Add to ``total (W*4)`` what view ``s`` sees in row y, less the frame.
 
-    One long function: numba counts references to arrays that are handed on within loops, which took two thirds of the
-    time.
+    Only numbers are handed on: numba counts references to arrays that are handed on within loops, which took two thirds
+    of the time.
     """
     colour, missed, cocs, bounds, far, tolerance = frame
     coc, low, high = cocs[min(s, len(cocs) - 1)], bounds[0, y], bounds[1, y]
@@ -114,9 +166,8 @@ def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
     w = len(low)
     h = len(coc) // w
     ux, uy = rays.views[s, 0], rays.views[s, 1]
-    along_x = abs(ux) >= abs(uy)
-    scale, length = (abs(ux), w) if along_x else (abs(uy), h)
-    px, limit, step = 1.0 / scale, length / scale, tolerance / scale
+    along_x, scale, px, limit = _pace(ux, uy, w, h)
+    step = tolerance / scale
     beside = np.uintp(w if along_x else 1)
     for x in range(w):
         near, away = np.float64(low[x]), np.float64(high[x])
@@ -124,9 +175,8 @@ def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
             continue
         out, here = 4 * x, 4 * (y * w + x)
         near, behind = min(max(near, -limit), limit), min(max(away, -limit), limit)
-        r = near
+        r = near if near == behind else np.nan
         if near != behind:  # `raycast._cast`
-            r = np.nan
             first, last = math.floor(near * scale), math.ceil(behind * scale)
             reach = max(abs(first), abs(last)) + 1
             inside = x >= reach and y >= reach and x + reach < w and y + reach < h
@@ -141,20 +191,11 @@ def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
                     q, m = (i, n + 1) if along_x else (i + 1, n)
                     a = np.float64(coc[np.uintp(_inside(n, h) * w + _inside(i, w))])
                     b = np.float64(coc[np.uintp(_inside(m, h) * w + _inside(q, w))])
-                nearest = a if shares[k] < 0.5 else b
-                after = a + (b - a) * shares[k] if abs(a - b) <= step else nearest
+                after = _between(a, b, shares[k], step)
                 ahead = after - j * px
                 if j > first:
-                    if abs(after - before) <= step:
-                        if (ahead <= 0.0) if in_front >= 0.0 else (ahead >= 0.0):
-                            share = in_front / (in_front - ahead) if in_front != ahead else 0.0
-                            r = (j - 1 + share) * px
-                            break
-                    elif in_front >= 0.0 and in_front * scale <= 0.5:
-                        r = before
-                        break
-                    elif ahead <= 0.0 and ahead * scale >= -0.5:
-                        r = after
+                    r = _hit(j, px, scale, step, before, after, in_front, ahead)
+                    if not math.isnan(r):
                         break
                 before, in_front = after, ahead
             if math.isnan(r):
@@ -165,23 +206,19 @@ def _add_view(total, frame, rays, s, y):  # type: ignore[no-untyped-def]
         # `raycast._look_up`
         u, v = min(max(x - r * ux, 0.0), w - 1.0), min(max(y - r * uy, 0.0), h - 1.0)
         i, n = int(u), int(v)
-        u -= i
-        v -= n
         p = np.uintp(n * w + i)
         right, below = np.uintp(1 if i + 1 < w else 0), np.uintp(w if n + 1 < h else 0)
-        wa, wb, wc, wd = (1.0 - v) * (1.0 - u), (1.0 - v) * u, v * (1.0 - u), v * u
+        wa, wb, wc, wd = _corners(u - i, v - n)
         if behind - near > 0.5 * step:  # or else there is only one surface within reach
             wa = wa if abs(coc[p] - r) <= step else 0.0
             wb = wb if abs(coc[p + right] - r) <= step else 0.0
             wc = wc if abs(coc[p + below] - r) <= step else 0.0
             wd = wd if abs(coc[p + right + below] - r) <= step else 0.0
-        weight = wa + wb + wc + wd
-        wa, inverse = (wa, 1.0 / weight) if weight > 0.0 else (1.0, 1.0)
-        # Weights add up to 1 but for 1e-16, which no float32 keeps: a constant picture stays constant.
-        add_one(total, out, colour, np.int64(p) << 2, wa * inverse)
-        add_one(total, out, colour, np.int64(p + right) << 2, wb * inverse)
-        add_one(total, out, colour, np.int64(p + below) << 2, wc * inverse)
-        add_one(total, out, colour, np.int64(p + right + below) << 2, wd * inverse)
+        wa, wb, wc, wd = _of_one(wa, wb, wc, wd)
+        add_one(total, out, colour, np.int64(p) << 2, wa)
+        add_one(total, out, colour, np.int64(p + right) << 2, wb)
+        add_one(total, out, colour, np.int64(p + below) << 2, wc)
+        add_one(total, out, colour, np.int64(p + right + below) << 2, wd)
         add_one(total, out, colour, here, -1.0)
 
 

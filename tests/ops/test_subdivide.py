@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from torchbokeh.ops.spans import Profile, area, edges_at, subdivide
+from torchbokeh.ops.spans import Profile, area, edges_at, heights_above, piece_at, subdivide
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 
@@ -42,6 +42,16 @@ def test_edges_of_the_disc_are_its_circle() -> None:
     left, right = edges_at(Disc().profile(), y)
     assert torch.allclose(right, (1 - y * y).sqrt(), atol=1e-12)
     assert torch.equal(left, -right)
+
+
+def test_half_the_area_ends_half_way_up_what_is_symmetric() -> None:
+    parts = torch.tensor([0.0, 1.0, 2.0], dtype=F64)
+    assert torch.allclose(heights_above(Disc().profile(), parts, 2), parts / 2, atol=1e-9)
+
+
+def test_heights_lie_in_the_piece_above_the_last_knot_that_they_reach() -> None:
+    knots = torch.tensor([[-1.0, 0, 0], [0.0, -1, 1], [1.0, 0, 0]], dtype=F64)
+    assert piece_at(knots, torch.tensor([-1.0, -0.5, 0.0, 1.0], dtype=F64)).tolist() == [0, 0, 1, 1]
 
 
 def test_the_width_between_the_edges_makes_up_the_area(shape: Aperture) -> None:
