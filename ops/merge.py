@@ -345,9 +345,11 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     if torch.is_grad_enabled() and not torch.compiler.is_compiling():  # for second derivatives: those of the definition
         out, *sources = tensors
         merging, highest = ctx.settings
-        settings = Profile(knots, bulge), Merging(*merging), highest, ctx.ones, out is not None
+        values, coc, weight = sources
+        settings = Merging(*merging), highest, ctx.ones, out is not None
+        again = _splat_merged_torch(values, coc, weight, Profile(knots, bulge), *settings)
         wanted = [t for t, asked in zip(sources, ctx.needs_input_grad[:3], strict=True) if asked]
-        found = iter(torch.autograd.grad(_splat_merged_torch(*sources, *settings), wanted, grad, create_graph=True))
+        found = iter(torch.autograd.grad(again, wanted, grad, create_graph=True))
         by = [next(found) if asked else None for asked in ctx.needs_input_grad[:3]]
         return *by, [None, None], *[None] * 4
     by_values, by_coc, by_weight = _gather_merged_op(grad, *tensors, [knots, bulge], *ctx.settings)
