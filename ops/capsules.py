@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchbokeh.ops.checks import check_image
-from torchbokeh.ops.dispatch import has_kernel
+from torchbokeh.ops.dispatch import has_kernel, refuse_transforms
 from torchbokeh.ops.points import flatten, unflatten
 from torchbokeh.ops.spans import MIN_RADIUS
 
@@ -49,6 +49,7 @@ def splat_capsules(values: Tensor, pixels: Tensor, radius: Tensor, motion: Tenso
     count = values.numel() // max(values.shape[1], 1)
     if len(pixels) and not 0 <= int(pixels.min()) <= int(pixels.max()) < count:
         raise ValueError(f"pixels: expected indices of {count} pixels, got {int(pixels.min())} to {int(pixels.max())}")
+    refuse_transforms("splat_capsules", values, radius, motion, centre)
     return _Capsules.apply(values, pixels, radius, motion, centre)
 
 

@@ -150,6 +150,19 @@ def check_image(
     return x
 
 
+def not_finite(x: Tensor) -> str:
+    """How many entries are not finite, for a message, and which is the first of them.
+
+    Example:
+        >>> not_finite(torch.tensor([1.0, 7e4]).half())
+        '1 that are not, first inf: float16 ends at 65504'
+    """
+    wrong = x.detach()[~x.detach().isfinite()]
+    end = f": {str(x.dtype).removeprefix('torch.')} ends at {torch.finfo(x.dtype).max:g}"
+    cause = end if x.dtype.itemsize < 4 and bool(wrong[0].isinf()) else ""
+    return f"{len(wrong)} that are not, first {wrong[0].item()}{cause}"
+
+
 def _written(shape: Sequence[int | str | None]) -> str:
     # Only ever called for an error: `torch.compile` cannot write down a size that is not fixed.
     return "(" + ", ".join(str(s) for s in shape) + ")"

@@ -58,8 +58,10 @@ def _pull_push(values: Tensor, weight: Tensor) -> Tensor:
     known, share = levels.pop()
     filled = known / share.clamp_min(TINY)
     for known, share in reversed(levels):
-        size = known.shape[-2:]
-        up = F.interpolate(filled, scale_factor=2, mode="bilinear", align_corners=False)[..., : size[0], : size[1]]
+        h, w = known.shape[-2:]
+        # What is one cell wide is broadcast: inductor cannot write a backward pass that scatters into it.
+        scale = [float(min(n, 2)) for n in filled.shape[-2:]]
+        up = F.interpolate(filled, scale_factor=scale, mode="bilinear", align_corners=False)[..., :h, :w]
         filled = known + (1 - share) * up
     return filled
 

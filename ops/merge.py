@@ -31,7 +31,7 @@ from torch.nn import functional as F
 
 from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_transforms
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
@@ -255,6 +255,7 @@ def splat_merged(
         if not math.isfinite(largest):
             raise ValueError(f"coc: expected finite radii, got one of {largest}")
         highest = highest_level(largest, (h, w), merging)
+    refuse_transforms("splat_merged", values, coc, weight, *profile)
     dtype = compute_dtype(values, coc)
     source, radius = values.to(dtype), coc.to(dtype)
     weight = None if weight is None else weight.to(dtype)
@@ -265,12 +266,24 @@ def splat_merged(
         knots, bulge = profile.knots.double(), profile.bulge.double()
         out = _splat_merged_op(source, radius, weight, [knots, bulge], merging, highest, ones, normalise)
     else:
-        if ones:
-            source = torch.cat([source, torch.ones_like(radius)], 1)
-        out = merged(source, radius, lambda v, r: splat_spans(v, r, profile, integrate=True), merging, highest, weight)
-        if normalise:
-            out = torch.cat([out[:, :-1] / out[:, -1:].clamp_min(TINY), out[:, -1:]], 1)
+        out = _splat_merged_torch(source, radius, weight, profile, merging, highest, ones, normalise)
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
+
+
+def _splat_merged_torch(
+    values: Tensor,
+    coc: Tensor,
+    weight: Tensor | None,
+    profile: Profile,
+    merging: Merging,
+    highest: int,
+    ones: bool,
+    normalise: bool,
+) -> Tensor:
+    if ones:
+        values = torch.cat([values, torch.ones_like(coc)], 1)
+    out = merged(values, coc, lambda v, r: splat_spans(v, r, profile, integrate=True), merging, highest, weight)
+    return torch.cat([out[:, :-1] / out[:, -1:].clamp_min(TINY), out[:, -1:]], 1) if normalise else out
 
 
 @torch.library.custom_op("torchbokeh::splat_merged", mutates_args=())
@@ -324,12 +337,22 @@ def _(
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    values, coc, weight, profile, *ctx.settings, _, normalise = inputs
+    values, coc, weight, profile, *ctx.settings, ctx.ones, normalise = inputs
     ctx.save_for_backward(output if normalise else None, values, coc, weight, *profile)
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *tensors, knots, bulge = ctx.saved_tensors
+    if torch.is_grad_enabled() and not torch.compiler.is_compiling():  # for second derivatives: those of the definition
+        out, *sources = tensors
+        merging, highest = ctx.settings
+        values, coc, weight = sources
+        settings = Merging(*merging), highest, ctx.ones, out is not None
+        again = _splat_merged_torch(values, coc, weight, Profile(knots, bulge), *settings)
+        wanted = [t for t, asked in zip(sources, ctx.needs_input_grad[:3], strict=True) if asked]
+        found = iter(torch.autograd.grad(again, wanted, grad, create_graph=True))
+        by = [next(found) if asked else None for asked in ctx.needs_input_grad[:3]]
+        return *by, [None, None], *[None] * 4
     by_values, by_coc, by_weight = _gather_merged_op(grad, *tensors, [knots, bulge], *ctx.settings)
     return by_values, by_coc, None if tensors[3] is None else by_weight, [None, None], *[None] * 4
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_image, check_kind, check_pixels, check_size
-from torchbokeh.ops.dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_second, refuse_transforms
 from torchbokeh.ops.spans import working_dtype
 
 CHUNK = 1 << 20
@@ -109,6 +109,7 @@ def splat_points(
         check_pixels("pad", height + 2 * pad, width + 2 * pad)
     if size is not None and position is None:
         raise ValueError("position: expected one beside size, got None")
+    refuse_transforms("splat_points", values, table.offsets, table.weights, rotation, position)
     work = working_dtype(values.device)
     out = _splat_points_op(
         values.to(compute_dtype(values)),
@@ -333,12 +334,43 @@ def _points_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     needs = ctx.needs_input_grad
     geometry = any(needs[2]) or needs[3] or needs[4]
     by_values, *found = _gather_points_op(grad, values, index, table, rotation, position, ctx.pad, geometry)
-    if not geometry:
-        return by_values, None, [None] * 3, *[None] * 4
-    by_points, *found = found
-    by_rotation, by_position = (None if t is None else found.pop(0) for t in (rotation, position))
+    return by_values, None, *_by_geometry(found, table, rotation, position), None, None
+
+
+def _by_geometry(
+    found: list[Tensor], table: Sequence[Tensor], rotation: Tensor | None, position: Tensor | None
+) -> tuple[Any, ...]:
+    """Gradients of ``table, rotation, position``, as far as `_gather_points_op` found any beside that of values."""
+    if not found:
+        return [None] * 3, None, None
+    by_points, *rest = found
+    by_rotation, by_position = (None if t is None else rest.pop(0) for t in (rotation, position))
     by_table = [by_points[:, :2].to(table[0].dtype), by_points[:, 2].to(table[1].dtype), None]
-    return by_values, None, by_table, by_rotation, by_position, None, None
+    return by_table, by_rotation, by_position
 
 
 _splat_points_op.register_autograd(_points_backward, setup_context=_points_setup)
+
+
+def _gather_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    grad, _, index, table, rotation, position, ctx.pad, _ = inputs
+    ctx.save_for_backward(index, *table, rotation, position, grad)
+    ctx.set_materialize_grads(False)
+
+
+def _gather_backward(ctx: Any, grads: list[Tensor | None]) -> tuple[Any, ...]:
+    """Of ``<grad, splat(by_values)>``, which is linear in both: the adjoint of the adjoint is the splat itself."""
+    by_values, *others = grads
+    refuse_second("splat_points", *others)
+    if by_values is None:
+        return *[None] * 3, [None] * 3, *[None] * 4
+    index, *table, rotation, position, grad = ctx.saved_tensors
+    size = [n - 2 * ctx.pad for n in grad.shape[-2:]]
+    by_grad = _splat_points_op(by_values, index, table, rotation, position, ctx.pad, size)
+    needs = ctx.needs_input_grad
+    geometry = any(needs[3]) or needs[4] or needs[5]
+    _, *found = _gather_points_op(grad, by_values, index, table, rotation, position, ctx.pad, geometry)
+    return by_grad, None, None, *_by_geometry(found, table, rotation, position), None, None
+
+
+_gather_points_op.register_autograd(_gather_backward, setup_context=_gather_setup)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_flag, check_image
-from torchbokeh.ops.dispatch import compute_dtype, has_kernel
+from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_second, refuse_transforms
 from torchbokeh.ops.points import PointTable, flatten, splat_points, unflatten
 from torchbokeh.ops.span_gradient import row_span_gradient
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, row_span, working_dtype
@@ -60,6 +60,7 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     check_image("coc", coc, (b, 1, h, w), like=values)
     check_profile(profile, values)
     check_flag("integrate", integrate)
+    refuse_transforms("splat_spans", values, coc, *profile)
     dtype = compute_dtype(values, coc)
     work = working_dtype(values.device)
     source, radius = values.to(dtype), coc.to(dtype)
@@ -191,3 +192,22 @@ def _spans_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
 
 
 _splat_spans_op.register_autograd(_spans_backward, setup_context=_spans_setup)
+
+
+def _gather_setup(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    ctx.save_for_backward(inputs[0], *inputs[2:5])
+    ctx.set_materialize_grads(False)
+
+
+def _gather_backward(ctx: Any, grads: list[Tensor | None]) -> tuple[Any, ...]:
+    """Of ``<grad, splat(by_values)>``, which is linear in both: the adjoint of the adjoint is the splat itself."""
+    by_values, *others = grads
+    refuse_second("splat_spans", *others)
+    if by_values is None:
+        return (None,) * 6
+    grad, *shape = ctx.saved_tensors
+    _, *by_shape = _gather_spans_op(grad, by_values, *shape, any(ctx.needs_input_grad[3:5]))
+    return _splat_spans_op(by_values, *shape, False), None, *by_shape, None
+
+
+_gather_spans_op.register_autograd(_gather_backward, setup_context=_gather_setup)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchbokeh.ops.checks import check_image, check_kind, check_whole
 from torchbokeh.ops.composite import bin_weights, check_centres, fill_until_full
-from torchbokeh.ops.dispatch import has_kernel
+from torchbokeh.ops.dispatch import has_kernel, refuse_transforms
 from torchbokeh.ops.merge import MOST_LEVELS, Merging, splat_merged
 from torchbokeh.ops.spans import Profile, check_profile
 
@@ -51,6 +51,7 @@ def blur_surface(
     check_profile(profile, colour)
     check_kind("merging", merging, Merging)
     check_whole("highest", highest, 0, MOST_LEVELS)
+    refuse_transforms("blur_surface", colour, weight, coc, *profile)
     hats = [None] if len(centres) == 1 else bin_weights(coc, centres, BLEND)
     weights = [hat if weight is None else weight if hat is None else hat * weight for hat in hats]
     asked = torch.is_grad_enabled() and any(

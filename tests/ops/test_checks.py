@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import torchbokeh.ops.checks
 from torchbokeh.ops.checks import (
@@ -17,6 +18,7 @@ from torchbokeh.ops.checks import (
     check_number,
     check_size,
     check_whole,
+    not_finite,
 )
 
 
@@ -35,6 +37,13 @@ def test_numbers_come_back_as_those_of_python() -> None:
     assert type(check_number("x", Fraction(1, 2))) is type(check_finite("x", np.float32(0.5), 0)) is float
     assert check_flag("flag", False) is False
     assert check_number("x", math.inf, 0) == math.inf
+
+
+def test_what_is_not_finite_is_counted_and_named() -> None:
+    values = torch.tensor([1.0, math.nan, -math.inf])
+    assert not_finite(values) == "2 that are not, first nan"
+    assert not_finite(values[2:]) == "1 that are not, first -inf"
+    assert not_finite(torch.tensor([6e4, 7e4]).half()) == "1 that are not, first inf: float16 ends at 65504"
 
 
 def test_kinds() -> None:

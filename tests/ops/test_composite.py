@@ -1,4 +1,5 @@
 import doctest
+import shutil
 from typing import Any
 
 import pytest
@@ -51,6 +52,26 @@ def test_one_known_pixel_fills_everything(size: tuple[int, int]) -> None:
     values, weight = holes(1, 2, *size, seed=size[0] * size[1] // 2, share=0.0)
     only = (values * weight).sum((2, 3), keepdim=True)
     assert torch.allclose(pull_push(values, weight), only.expand_as(values), rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (7, 1), (1, 8), (9, 3)])
+def test_gradients_are_the_same_compiled(size: tuple[int, int], threads: int) -> None:
+    torch._dynamo.reset()
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)  # on two, inductor writes other loops
+    try:
+        given = [t.float().requires_grad_() for t in holes(1, 3, *size, seed=6)]
+        found, wanted = (
+            torch.autograd.grad(run(*given).square().sum(), given) for run in (torch.compile(pull_push), pull_push)
+        )
+    finally:
+        torch.set_num_threads(before)
+        torch._dynamo.reset()
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
 
 
 def test_nothing_known_gives_zero() -> None:

@@ -1,6 +1,7 @@
 """Banks: built, written, read, refused; what they hold."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,8 @@ def test_other_files_are_refused(small: PsfBank, tmp_path: Path) -> None:
         ({"settings": {"wrong": 1}}, "settings: expected those of simple-lens"),
         ({"settings": {"radius": 7.0}}, "its samples stand elsewhere"),
         ({"digest": ""}, "the data was changed"),
+        ({"info": {"ssim": [math.nan]}}, "its header cannot be read .*expected finite numbers, got NaN"),
+        ({"info": {"ssim": [math.inf]}}, "its header cannot be read .*expected finite numbers, got Infinity"),
     ],
 )
 def test_a_header_that_does_not_fit_is_refused(
@@ -144,6 +147,23 @@ def test_a_header_that_does_not_fit_is_refused(
     save_file(load_file(path), path, {"torchbokeh": json.dumps({**head, **change})})
     with pytest.raises(ValueError, match=message):
         PsfBank.load(path)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_values_that_are_not_finite_are_refused(small: PsfBank, tmp_path: Path, value: float) -> None:
+    small.values[0, 0] = value
+    small.save(tmp_path / "bank.safetensors")
+    with pytest.raises(ValueError, match="its tensors do not fit each other"):
+        PsfBank.load(tmp_path / "bank.safetensors")
+
+
+def test_counts_whose_differences_wrap_are_refused(small: PsfBank, tmp_path: Path) -> None:
+    # As int32, from 1.5e9 to -1.5e9 it goes up, to gigabytes of points.
+    small.counts[1], small.counts[2] = 1_500_000_000, -1_500_000_000
+    assert bool((small.counts[:3].diff() >= 0).all())
+    small.save(tmp_path / "bank.safetensors")
+    with pytest.raises(ValueError, match="its tensors do not fit each other"):
+        PsfBank.load(tmp_path / "bank.safetensors")
 
 
 @pytest.mark.parametrize("place", [k / 40 for k in range(40)])

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from torchbokeh.banks.highlights import brightness_classes, dense_highlights, ordinary_brightness, support
 from torchbokeh.banks.samples import BankSettings, Source, splat_samples, spreading
-from torchbokeh.ops.checks import check_image
+from torchbokeh.ops.checks import check_image, not_finite
 from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.dispatch import has_numbers
 from torchbokeh.ops.merge import SPREAD, Merging, highest_level, merged
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
@@ -40,13 +41,13 @@ def bank_labels(
         if given is None:
             continue
         check_image(name, given, (b, count, h, w), like=image)
-        if torch.compiler.is_compiling() or given.numel() == 0:
+        if not has_numbers(given) or given.numel() == 0:
             continue
         low, high = given.detach().aminmax()
         if name == "depth" and not bool(low > 0):
             raise ValueError(f"depth: expected values above 0 (inf is sky), got one of {low.item():g}")
-        if name != "depth" and not bool((high - low).isfinite()):
-            raise ValueError(f"{name}: expected finite values, got {int((~given.isfinite()).sum())} that are not")
+        if name != "depth" and not bool(low.isfinite() & high.isfinite()):
+            raise ValueError(f"{name}: expected finite values, got {not_finite(given)}")
     colours = bank.values.shape[1]
     if channels % colours:
         raise ValueError(f"image: expected a multiple of {colours} channels for coloured PSFs, got {channels}")

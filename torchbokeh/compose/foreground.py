@@ -8,6 +8,7 @@ from torch import Tensor
 from torchbokeh.compose.composition import CERTAIN
 from torchbokeh.compose.surfaces import COARSE, enlarged, fill_hidden
 from torchbokeh.ops.composite import TINY, pull_push
+from torchbokeh.ops.dispatch import refuse_transforms
 from torchbokeh.ops.merge import Merging, splat_merged
 from torchbokeh.ops.spans import Profile
 from torchbokeh.ops.surface import blur_surface
@@ -28,6 +29,7 @@ def foreground_over_rest(image: Tensor, coc: Tensor, bins: Bins, profile: Profil
         detail: how far pixels are merged.
     """
     assert detail.merging is not None
+    refuse_transforms("foreground_over_rest", image, coc, *profile)
     return _foreground_over_rest_op(image, coc, *bins, list(profile), list(detail.merging), detail.highest)
 
 

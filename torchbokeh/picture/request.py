@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from torchbokeh.lens.base import Lens
-from torchbokeh.ops.checks import check_image
-from torchbokeh.ops.dispatch import compute_dtype
+from torchbokeh.ops.checks import check_image, not_finite
+from torchbokeh.ops.dispatch import compute_dtype, has_numbers
 from torchbokeh.picture.motion import Displacements, Motion, checked_displacements
 from torchbokeh.picture.sensor import Sensor
 from torchbokeh.psfs.model import Labels
@@ -208,9 +208,9 @@ def checked_radii(name: str, coc: Tensor) -> Tensor:
     Raises:
         ValueError: one of them is not finite.
     """
-    if torch.compiler.is_compiling() or not coc.numel():
+    if not has_numbers(coc) or not coc.numel():
         return coc
     low, high = coc.detach().aminmax()  # several times as fast as `isfinite`; NaN is both
-    if not bool((high - low).isfinite()):
-        raise ValueError(f"{name}: expected finite radii, got {int((~coc.isfinite()).sum())} that are not")
+    if not bool(low.isfinite() & high.isfinite()):
+        raise ValueError(f"{name}: expected finite radii, got {not_finite(coc)}")
     return coc.clamp(-WIDEST, WIDEST) if bool((high > WIDEST) | (low < -WIDEST)) else coc

@@ -12,6 +12,9 @@ from torchbokeh.renderers.accumulation import AccumulationBuffer
 from torchbokeh.views.points import Views
 from torchbokeh.views.prism import Prism
 
+FINE = 256
+"""Wavelengths that tell in which channels an equaliser leaves light."""
+
 
 class ChromaticAccumulation(AccumulationBuffer):
     """`AccumulationBuffer` of a lens with dispersion (chapter 4 of the defocus and bokeh dissertation).
@@ -19,7 +22,8 @@ class ChromaticAccumulation(AccumulationBuffer):
     Each view has a wavelength as well as a point of the lens: the points fill a cylinder, lens by spectrum, evenly
     (Halton, bases 2, 7 and 11). What a view of wavelength λ shows at the pinhole position p is moved by
     ``(coc(λ) - coc) v + p (m(λ) - 1)``, with v the point of the lens, and adds to the picture what the eye sees of λ;
-    every channel is divided by the sum of that, so that white stays white.
+    every channel is divided by the sum of that, so that white stays white; a channel that none of a few views
+    meets takes an equal part of each of them.
 
     In the mode ``"rgb"`` of `Dispersion` a third of the views go to each of three wavelengths, through the same points
     of the lens: what is grey and in focus stays grey. Without dispersion it is the `AccumulationBuffer`.
@@ -66,4 +70,8 @@ class ChromaticAccumulation(AccumulationBuffer):
         points = halton(self.views, first=self.first, seed=self.seed)
         lens = aperture_points(profile, points[:, [0, 3]]).cpu()
         views = Views(lens, stratified(points[:, 1]) - 0.5, points[:, [2, 5]] - 0.5)
-        return views, *spectral_samples(points[:, 4], dispersion.equaliser)
+        wavelengths, rgb = spectral_samples(points[:, 4], dispersion.equaliser)
+        # A channel that too few views miss takes an equal part of each; one that the equaliser leaves dark stays so.
+        unit = (torch.arange(FINE, dtype=points.dtype) + 0.5) / FINE
+        lit = (spectral_samples(unit, dispersion.equaliser)[1] > 0).any(0)
+        return views, wavelengths, torch.where(lit & (rgb == 0).all(0), 1 / len(rgb), rgb)

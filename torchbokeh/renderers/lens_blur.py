@@ -45,7 +45,9 @@ class LensBlur(nn.Module):
       out: the gradient is that of the smooth blur that merging approximates;
     * with ``shutter_depth``, radii come from there; ``depth`` then only says what is in front.
 
-    The backward pass draws PSFs anew: what is kept for it does not grow with them. There are no second derivatives.
+    The backward pass draws PSFs anew: what is kept for it does not grow with them. Second derivatives are
+    those of a gradient to the image, as a penalty on it needs; others, forward mode and ``torch.func.grad`` raise a
+    RuntimeError that names the operator.
 
     Args:
         lens: turns depth into signed CoC; may be left out if ``coc=`` is passed to every call.

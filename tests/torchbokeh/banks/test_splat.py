@@ -257,6 +257,9 @@ def test_what_is_refused(bank: PsfBank) -> None:
         KernelSplatting(bank=bank)(image, coc)
     with pytest.raises(ValueError, match="combined: expected coc and motion, got no coc"):
         KernelSplatting(bank=bank).plan(image, motion=torch.zeros(1, 2, 8, 8))
+    wide = torch.full((1, 2, 8, 8), 6e4).half()
+    wide[:, 1] = -6e4  # finite, though their difference is infinite in half precision
+    KernelSplatting(bank=bank).plan(image.half(), coc.half(), motion=wide)
     with pytest.raises(ValueError, match="motion: expected finite values, got 1 that are not"):
         KernelSplatting(bank=bank)(
             image, coc, motion=torch.full((1, 2, 8, 8), 1.0).index_put((torch.tensor(0),) * 4, torch.tensor(math.nan))

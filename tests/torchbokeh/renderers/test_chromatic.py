@@ -419,6 +419,24 @@ def test_what_does_not_fit_is_refused(make: Any, error: type[Exception], message
         make()
 
 
+@pytest.mark.parametrize("spectrum", SPECTRA)
+@pytest.mark.parametrize("views", [1, 2, 3, 5])
+def test_white_is_white_and_opaque_with_any_number_of_views(spectrum: Any, views: int) -> None:
+    lens = thin(Dispersion("BK7", 0.3, lateral=0.01, spectrum=spectrum))
+    white = torch.ones(1, 1, 4, H, W)
+    out = tb.ChromaticAccumulation(lens, views=views)(white, torch.full((1, 1, 1, H, W), 2.0))
+    torch.testing.assert_close(out, torch.ones_like(out))
+
+
+def test_a_channel_that_the_equaliser_leaves_dark_stays_dark_with_one_view() -> None:
+    dispersion = Dispersion("BK7", spectrum="continuous", equaliser=lambda nm: ((nm > 400) & (nm < 420)).to(nm))
+    out = tb.ChromaticAccumulation(thin(dispersion), views=1)(
+        torch.ones(1, 1, 4, H, W), torch.full((1, 1, 1, H, W), 2.0)
+    )
+    assert out[:, 1].abs().max() == 0
+    torch.testing.assert_close(out[:, 2], torch.ones(1, H, W))
+
+
 def test_docstring_examples() -> None:
     result = doctest.testmod(torchbokeh.renderers.chromatic)
     assert result.attempted > 1

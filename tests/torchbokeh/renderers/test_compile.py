@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 import torchbokeh as tb
 
@@ -104,18 +105,65 @@ def test_default_backend() -> None:
     torch.testing.assert_close(compiled(image, depth, plan=plan), blur(image, depth, plan=plan))
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("kind", ["image", "layers"])
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_gradients_of_the_default_backend(quality: str, kind: str, threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)  # on two, inductor writes other loops
+    try:
+        blur = lens_blur(quality)
+        image, depth = (t.requires_grad_() for t in scene(kind))
+        plan = blur.plan(image, depth)
+        found, wanted = (
+            torch.autograd.grad(run(image, depth, plan=plan).square().sum(), (image, depth))
+            for run in (torch.compile(blur, fullgraph=True), blur)
+        )
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_fake_tensors(quality: str) -> None:
+    blur = lens_blur(quality)
+    planned = blur.planned(blur.plan(*scene("image")))
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        image, depth = (mode.from_tensor(t) for t in scene("image"))
+        assert planned(image, depth).shape == image.shape
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_a_penalty_on_gradients(quality: str) -> None:
+    blur = lens_blur(quality)
+    image, depth = scene("image")
+    plan = blur.plan(image, depth)
+
+    def penalty(image: Tensor) -> Tensor:
+        loss = blur(image, depth, plan=plan).square().sum()
+        return torch.autograd.grad(loss, image, create_graph=True)[0].square().sum()
+
+    (slope,) = torch.autograd.grad(penalty(image.requires_grad_()), image)
+    # It is quadratic in the image.
+    torch.testing.assert_close((slope * image).sum(), 2 * penalty(image), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_forward_mode_is_refused(quality: str) -> None:
+    image, depth = scene("image")
+    with pytest.raises(RuntimeError, match="has no derivative in forward mode"):
+        torch.func.jvp(lambda t: lens_blur(quality)(t, depth), (image,), (image,))
+    with pytest.raises(RuntimeError, match="has no derivative in forward mode"):
+        torch.func.jvp(lambda t: tb.KernelSplatting(quality=quality)(t, 5 * depth), (image,), (image,))
+
+
 @pytest.mark.parametrize("quality", ["exact", "balanced"])
 def test_exported_program(quality: str) -> None:
-    class Planned(torch.nn.Module):
-        def __init__(self, image: Tensor, depth: Tensor) -> None:
-            super().__init__()
-            self.blur = lens_blur(quality)
-            self.plan = self.blur.plan(image, depth)
-
-        def forward(self, image: Tensor, depth: Tensor) -> Tensor:
-            return self.blur(image, depth, plan=self.plan)
-
-    planned = Planned(*scene("image"))
+    blur = lens_blur(quality)
+    planned = blur.planned(blur.plan(*scene("image")))
     with torch.no_grad():
         program = torch.export.export(planned, scene("image"))
         for seed in range(3):

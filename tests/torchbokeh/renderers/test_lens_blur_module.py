@@ -190,6 +190,16 @@ def test_what_a_call_refuses(arguments: dict[str, Any], error: type[Exception], 
             call(**arguments)
 
 
+def test_radii_that_half_precision_holds_are_taken_and_others_named() -> None:
+    image, coc = torch.ones(1, 3, 8, 8).half(), torch.full((1, 1, 8, 8), 6e4).half()
+    coc[..., :4] = -6e4  # their difference is infinite in half precision
+    assert LensBlur()(image, coc=coc).isfinite().all()
+    with pytest.raises(
+        ValueError, match="coc: expected finite radii, got 64 that are not, first inf: float16 ends at 65504"
+    ):
+        LensBlur()(image, coc=(coc.float().abs() + 1e4).half())
+
+
 def test_depth_needs_a_lens() -> None:
     with pytest.raises(ValueError, match="depth: expected coc, since there is no lens, got depth"):
         LensBlur()(IMAGE, DEPTH)
