@@ -10,7 +10,6 @@ from numbers import Real
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from torchbokeh.ops.checks import check_image, check_number
 from torchbokeh.ops.dispatch import only_definitions
@@ -23,7 +22,8 @@ def pull_push(values: Tensor, weight: Tensor) -> Tensor:
     """Fill holes smoothly from their surroundings (Gortler et al., "The Lumigraph", 1996, section 3.3.2).
 
     Pull: the known values are averaged over ever larger blocks. Push: on the way back, what a level lacks in weight
-    is taken from the next coarser one, interpolated bilinearly.
+    is taken from the next coarser one, interpolated bilinearly. Blocks lie evenly in a picture of any size: a flipped
+    or transposed picture is filled with the flipped or transposed values.
 
     Args:
         values: ``(B, C, H, W)``.
@@ -47,21 +47,46 @@ def pull_push(values: Tensor, weight: Tensor) -> Tensor:
     return _pull_push_op(values, weight) if only_definitions() else _pull_push(values, weight)
 
 
+def _halved(t: Tensor, dim: int) -> Tensor:
+    """Sums of pairs along ``dim``, the same from both ends.
+
+    Of an odd number, one in two is in the middle of a sum, and gives half of itself to both sides.
+    """
+    n = t.shape[dim]
+    if n == 1:
+        return t
+    pieces: list[slice] = [slice(None)] * t.ndim
+    first, second = (t[(*pieces[:dim], slice(k, None, 2))] for k in (0, 1))
+    if n % 2 == 0:
+        return first + second
+    none, half = torch.zeros_like(t.narrow(dim, 0, 1)), 0.5 * second
+    return first + (torch.cat([none, half], dim) + torch.cat([half, none], dim))
+
+
+def _doubled(t: Tensor, dim: int, n: int) -> Tensor:
+    """Back to ``n`` along ``dim``, interpolated linearly between the centres of what `_halved` has summed."""
+    m = t.shape[dim]
+    if n == 1:
+        return t
+    after = torch.cat([t.narrow(dim, 1, m - 1), t.narrow(dim, m - 1, 1)], dim)
+    if n % 2:
+        pair = [t, torch.lerp(t, after, 0.5)]
+    else:
+        before = torch.cat([t.narrow(dim, 0, 1), t.narrow(dim, 0, m - 1)], dim)
+        pair = [torch.lerp(t, side, 0.25) for side in (before, after)]
+    return torch.stack(pair, dim + 1).flatten(dim, dim + 1).narrow(dim, 0, n)
+
+
 def _pull_push(values: Tensor, weight: Tensor) -> Tensor:
     levels = [(values * weight, weight)]
     while max(levels[-1][1].shape[-2:]) > 1:
-        known, share = levels[-1]
-        odd = (0, known.shape[-1] % 2, 0, known.shape[-2] % 2)
-        known, share = (F.avg_pool2d(F.pad(t, odd), 2) * 4 for t in (known, share))
+        known, share = (_halved(_halved(t, 2), 3) for t in levels[-1])
         full = share.clamp(max=1)
         levels.append((known * (full / share.clamp_min(TINY)), full))
     known, share = levels.pop()
     filled = known / share.clamp_min(TINY)
     for known, share in reversed(levels):
-        h, w = known.shape[-2:]
-        # What is one cell wide is broadcast: inductor cannot write a backward pass that scatters into it.
-        scale = [float(min(n, 2)) for n in filled.shape[-2:]]
-        up = F.interpolate(filled, scale_factor=scale, mode="bilinear", align_corners=False)[..., :h, :w]
+        up = _doubled(_doubled(filled, 2, known.shape[2]), 3, known.shape[3])
         filled = known + (1 - share) * up
     return filled
 

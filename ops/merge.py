@@ -39,7 +39,11 @@ FADE = 0.125
 """Radii from one to ``1 + FADE`` times the least radius of a level belong partly to the level below."""
 
 STEPS = 64
-"""Radii are rounded to this fraction of a cell, so that few PSFs have to be drawn for many cells."""
+"""Mean radii are rounded to this fraction of a cell, and those of pixels from `EVEN` px on: few PSFs are drawn."""
+
+EVEN = 12.0
+"""Smaller radii, in cells, take steps in proportion to their square, as the weights of small PSFs change faster: by up
+to 2e-4 from one step to the next."""
 
 MARGIN = 2
 """Cells around the picture of a level: interpolation at the border looks beyond it."""
@@ -100,6 +104,15 @@ def level_shares(
     return [(above[k] - above[k + 1]).to(values.dtype) for k in range(highest + 1)]
 
 
+def rounded(radius: Tensor) -> Tensor:
+    """Radii in cells, rounded to steps (see `STEPS` and `EVEN`); those of the identity are kept."""
+    most, even = 1 / MIN_RADIUS, EVEN**2 * (1 / MIN_RADIUS - 1 / EVEN)
+    number = EVEN**2 * (most - 1 / radius.clamp(MIN_RADIUS, EVEN)) + (radius - EVEN).clamp_min(0)
+    number = (number * STEPS).round() / STEPS
+    graded = 1 / (most - number.clamp_max(even) / EVEN**2)
+    return torch.where(radius > MIN_RADIUS, graded + (number - even).clamp_min(0), radius)
+
+
 def merge_cells(
     values: Tensor,
     coc: Tensor,
@@ -137,8 +150,9 @@ def merge_cells(
         radius = total(counted * coc.abs()) / amount / size
         if level:
             radius = (radius.square() - SPREAD).clamp_min(MIN_RADIUS**2).sqrt()
-        rounded = (radius.detach() * STEPS).round() / STEPS
-        radius = radius + (rounded - radius.detach())
+        exact = radius.detach().to(working_dtype(coc.device))
+        step = rounded((exact * STEPS).round() / STEPS if level else exact)
+        radius = radius + (step.to(radius.dtype) - radius.detach())
         factor = share if weight is None else share * torch.where(weight > 0, weight, 0.0)
         # What is infinite stays on its own levels.
         level_maps = (

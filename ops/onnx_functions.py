@@ -1,9 +1,9 @@
 """What the operators of this package become in an exported ONNX file: standard operators only.
 
-`splat_rows` and what it calls are functions of the file: a loop over the rows of the PSFs, as `torchbokeh.ops.splat`
-has it. Two things differ, since onnxruntime has no arc functions in double: the angle between the two ends of a slab is
-taken in float32, from its sine and cosine in double, so that it is exact to a relative 1e-7; and knots are found by
-halving.
+`splat_rows`, what it calls, `halved` and `doubled` are functions of the file. `splat_rows` is a loop over the rows of
+the PSFs, as `torchbokeh.ops.splat` has it. Two things differ there, since onnxruntime has no arc functions in double:
+the angle between the two ends of a slab is taken in float32, from its sine and cosine in double, so that it is exact to
+a relative 1e-7; and knots are found by halving.
 """
 
 # ruff: noqa: F821 (names of sizes)
@@ -146,16 +146,49 @@ def splat_rows(
     return op.Slice(planes, [0], op.Reshape(width, [1]), [3])
 
 
-def _schema(name, inputs):
+@script(DOMAIN)
+def halved(x: FLOAT["B", "C", "H", "W"]) -> FLOAT["B", "C", "V", "H"]:
+    """`torchbokeh.ops.composite._halved` along the last axis, which then goes before the other."""
+    end = op.Constant(value_ints=[2147483647])
+    odd = op.Mod(op.Shape(x, start=3), op.Constant(value_ints=[2]))
+    none, one = op.Constant(value_ints=[0, 0, 0]), op.Constant(value_ints=[1])
+    padded = op.Pad(x, op.Concat(none, odd, none, one, axis=0))
+    outer = op.Slice(padded, [0], end, [3], [2])
+    inner = op.Slice(padded, [1], end, [3], [2])
+    before = op.Slice(outer, [0], [-1], [3])
+    after = op.Slice(outer, [1], end, [3])
+    sides = op.Where(op.Equal(odd, one), op.CastLike(0.5, x) * (before + after), before)
+    return op.Transpose(inner + sides, perm=[0, 1, 3, 2])
+
+
+@script(DOMAIN)
+def doubled(x: FLOAT["B", "C", "H", "W"], n: INT64[1]) -> FLOAT["B", "C", "V", "H"]:
+    """`torchbokeh.ops.composite._doubled` along the last axis, which then goes before the other."""
+    end = op.Constant(value_ints=[2147483647])
+    odd = op.Equal(op.Mod(n, op.Constant(value_ints=[2])), op.Constant(value_ints=[1]))
+    half = op.CastLike(0.5, x)
+    quarter = op.CastLike(0.25, x)
+    before = op.Concat(op.Slice(x, [0], [1], [3]), op.Slice(x, [0], [-1], [3]), axis=3)
+    after = op.Concat(op.Slice(x, [1], end, [3]), op.Slice(x, [-1], end, [3]), axis=3)
+    first = op.Where(odd, x, x + quarter * (before - x))
+    second = x + op.Where(odd, half, quarter) * (after - x)
+    pairs = op.Concat(op.Unsqueeze(first, [4]), op.Unsqueeze(second, [4]), axis=4)
+    whole = op.Reshape(pairs, op.Constant(value_ints=[0, 0, 0, -1]))
+    return op.Transpose(op.Slice(whole, [0], n, [3]), perm=[0, 1, 3, 2])
+
+
+def _schema(name, inputs, out="double"):
     formal = onnx.defs.OpSchema.FormalParameter
     given = [formal(k, f"tensor({dtype})") for k, dtype in inputs.items()]
     return onnx.defs.OpSchema(
-        name, DOMAIN.domain, DOMAIN.version, inputs=given, outputs=[formal("out", "tensor(double)")]
+        name, DOMAIN.domain, DOMAIN.version, inputs=given, outputs=[formal("out", f"tensor({out})")]
     )
 
 
 _DOUBLES = ("values", "coc", "knots", "bulge", "integrals", "slopes", "whole")
 SPLAT_ROWS = Op(DOMAIN, "splat_rows", _schema("splat_rows", dict.fromkeys(_DOUBLES, "double") | {"strides": "int64"}))
+HALVED = Op(DOMAIN, "halved", _schema("halved", {"x": "float"}, "float"))
+DOUBLED = Op(DOMAIN, "doubled", _schema("doubled", {"x": "float", "n": "int64"}, "float"))
 
 
 def splat_spans(values, coc, knots, bulge, integrate=False):
@@ -190,21 +223,15 @@ def pull_push(values, weight):
     tiny = op.CastLike(1e-12, values)
     known, share, levels = op.Mul(values, weight), weight, []
 
-    def halved(x, odd):
-        return op.Mul(op.AveragePool(op.Pad(x, odd), kernel_shape=[2, 2], strides=[2, 2]), op.CastLike(4.0, x))
-
     for _ in range(LEVELS):
-        size = op.Shape(share, start=2)
-        levels.append((known, share, size))
-        odd = op.Concat(op.Constant(value_ints=[0] * 6), op.Mod(size, 2), axis=0)
-        known, share = halved(known, odd), halved(share, odd)
+        levels.append((known, share))
+        known, share = (HALVED(HALVED(x)) for x in (known, share))
         full = op.Min(share, one)
         known, share = op.Mul(known, op.Div(full, op.Max(share, tiny))), full
     filled = op.Div(known, op.Max(share, tiny))
-    for known, share, size in reversed(levels):
-        scales = op.Constant(value_floats=[1.0, 1.0, 2.0, 2.0])
-        up = op.Resize(filled, None, scales, mode="linear", coordinate_transformation_mode="half_pixel")
-        up = op.Slice(up, [0, 0], size, [2, 3])
+    for known, share in reversed(levels):
+        height, width = op.Shape(share, start=2, end=3), op.Shape(share, start=3)
+        up = DOUBLED(DOUBLED(filled, width), height)
         filled = op.Add(known, op.Mul(op.Sub(one, share), up))
     return filled
 
@@ -217,7 +244,7 @@ def translations():
 
 def functions():
     """Functions of standard operators that an exported file has to hold."""
-    made = [f.to_function_proto() for f in (edge_integrals, arc_integral, add_differences, splat_rows)]
+    calling = [f.to_function_proto() for f in (edge_integrals, arc_integral, add_differences, splat_rows)]
     own = onnx.helper.make_opsetid(DOMAIN.domain, DOMAIN.version)
-    made[-1].opset_import.append(own)  # onnxscript leaves it out, as the calls stand in a loop
-    return made
+    calling[-1].opset_import.append(own)  # onnxscript leaves it out, as the calls stand in a loop
+    return [*calling, halved.to_function_proto(), doubled.to_function_proto()]

@@ -11,7 +11,7 @@ same bits for every thread count.
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numba as nb
@@ -21,7 +21,16 @@ from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.kernels.merge_collect import BAND, RECORD, Lanes, Levels, Picture, bands, classify, collect
-from torchbokeh.ops.kernels.radius_bank import RadiusBank, draw_psf, psf_buffer, radius_bank, rounded, rows_within
+from torchbokeh.ops.kernels.radius_bank import (
+    RadiusBank,
+    draw_psf,
+    number_of,
+    psf_buffer,
+    radius_bank,
+    radius_of,
+    rounded,
+    rows_within,
+)
 from torchbokeh.ops.kernels.rows import draw_rows, running_sum
 from torchbokeh.ops.kernels.splat import clamped, row_range, shape_of
 from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, STEPS, Merging
@@ -45,14 +54,14 @@ class Row(NamedTuple):
     """What a row of ``W`` pixels holds on the lowest level.
 
     Beside what `classify` fills in, and ``energy (W,)`` as scratch: the interleaved ``pixels (4 W,)``, and
-    ``radii (W,)`` in steps of the bank, -1 for a pixel that has nothing there.
+    ``numbers (W,)`` of PSFs in the bank, -1 for a pixel that has nothing there.
     """
 
     levels: np.ndarray
     shares: np.ndarray
     energy: np.ndarray
     pixels: np.ndarray
-    radii: np.ndarray
+    numbers: np.ndarray
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -90,6 +99,12 @@ def coarser(coarse, y, margin, line, fine):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
+def cell_number(radius):  # type: ignore[no-untyped-def]
+    """The number of the PSF that stands for the mean radius of a cell: rounded before, as in `merge.merge_cells`."""
+    return number_of(np.rint(STEPS * radius) / STEPS)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def cell_radius(cells, p, scale):  # type: ignore[no-untyped-def]
     """Mean radius of a cell in cells of its level, less what interpolation will add."""
     mean = scale * (cells[p + 5] / cells[p + 4])
@@ -114,7 +129,7 @@ def finish_row(band, pad, coarse, y, margin, scratch, row):  # type: ignore[no-u
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyped-def]
     """A band of a level above the lowest: ``out (rows + 2*MARGIN, columns + 2*MARGIN, 4)``."""
-    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, bank_rows = bank
     sums, stride, y0, y1 = band
     cells, reach = levels.cells, levels.reach[level]
     rows, across, start = levels.sizes[level, 0], levels.sizes[level, 1], levels.sizes[level, 2]
@@ -130,16 +145,16 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
         p = RECORD * (start + j * across)
         for i in range(across):
             if cells[p] != 0.0 or cells[p + 1] != 0.0 or cells[p + 2] != 0.0 or cells[p + 3] != 0.0:
-                radius = np.rint(bank_steps * cell_radius(cells, p, scale))
-                if radius < in_bank:
-                    k = int(radius)
+                number = cell_number(cell_radius(cells, p, scale))
+                if number < in_bank:
+                    k = int(number)
                     if cells[p + 6] < 0.0:
                         k += mirrored
                     first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
                     o = (first - y0) * stride + 4 * (pad + MARGIN + i)
                     draw_rows(sums, o, stride, cells, p, bank_rows, span)
                 else:
-                    coc = math.copysign(radius / bank_steps, cells[p + 6])
+                    coc = math.copysign(radius_of(number), cells[p + 6])
                     _draw_wide(band, pad, cells, p, i + MARGIN, y, coc, buffer)
             p += RECORD
     scratch = interpolation_rows(coarse, out.shape[1])
@@ -148,10 +163,10 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _lowest(picture, lanes, y, bank_steps, in_bank, row):  # type: ignore[no-untyped-def]
+def _lowest(picture, lanes, y, in_bank, row):  # type: ignore[no-untyped-def]
     """Fill ``row`` from row ``y`` of the picture, once `classify` has filled its levels and shares."""
     values, coc, weight = picture
-    levels, shares, energy, pixels, radii = row
+    levels, shares, energy, pixels, numbers = row
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(levels)):
         level = levels[x]
@@ -175,36 +190,35 @@ def _lowest(picture, lanes, y, bank_steps, in_bank, row):  # type: ignore[no-unt
             for x in range(len(shares)):
                 lane[4 * x] = shares[x] * value
                 energy[x] += shares[x] * value
-    steps, most = np.float32(bank_steps), np.float32(in_bank)
     signed = coc[y]
     for x in range(len(signed)):
-        radius = min(np.rint(steps * abs(signed[x])), most)
-        radii[x] = np.int32(-one if energy[x] == zero else radius)
+        number = min(number_of(abs(signed[x])), in_bank)
+        numbers[x] = np.int32(-1 if energy[x] == zero else number)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def draw_pixels(picture, lanes, levels, bank, band):  # type: ignore[no-untyped-def]
     """Draw the lowest level and the highlights into a band."""
     values, coc, weight = picture
-    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, bank_rows = bank
     sums, stride, y0, y1 = band
     height, width = coc.shape
     sums[: (y1 - y0) * stride] = 0.0
     buffer = psf_buffer(shape, BAND)
     in_bank = mirrored if mirrored else len(firsts)
     kinds, rest, energy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
-    pixels, radii = np.empty(4 * width, np.float32), np.empty(width, np.int32)
-    row = Row(kinds, rest, energy, pixels, radii)
+    pixels, numbers = np.empty(4 * width, np.float32), np.empty(width, np.int32)
+    row = Row(kinds, rest, energy, pixels, numbers)
     reach = levels.reach[0]
     for y in range(height):
         r = reach[y]
         if r < 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
         begin, end = classify(picture, levels.thresholds, y, kinds, rest)
-        _lowest(picture, lanes, y, bank_steps, in_bank, row)
+        _lowest(picture, lanes, y, in_bank, row)
         for x in range(begin, end):
             p = 4 * x
-            k = int(radii[x])
+            k = int(numbers[x])
             if k < 0:
                 continue
             if k < in_bank:
@@ -213,14 +227,14 @@ def draw_pixels(picture, lanes, levels, bank, band):  # type: ignore[no-untyped-
                 first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
                 draw_rows(sums, (first - y0) * stride + 4 * (pad + x), stride, pixels, p, bank_rows, span)
             else:
-                _draw_wide(band, pad, pixels, p, x, y, rounded(np.float64(coc[y, x]), bank_steps), buffer)
+                _draw_wide(band, pad, pixels, p, x, y, rounded(np.float64(coc[y, x])), buffer)
     for mark in levels.marks:
         y, x = mark // width, mark % width
         for k in range(4):
             pixels[k] = values[lanes.channel[k], y, x] if lanes.channel[k] >= 0 else lanes.constant[k]
             if weight.shape[0] > 0:
                 pixels[k] *= weight[y, x]
-        _draw_wide(band, pad, pixels, 0, x, y, rounded(np.float64(coc[y, x]), bank_steps), buffer)
+        _draw_wide(band, pad, pixels, 0, x, y, rounded(np.float64(coc[y, x])), buffer)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -250,7 +264,16 @@ def _pixel_band(picture, lanes, levels, bank, coarse, last, out, band):  # type:
 
 def bank_for(profile: Profile, merging: Merging, *, slopes: bool = False) -> RadiusBank:
     """The PSFs of every cell but those that are wider than the levels would have them, or than `WIDEST`."""
-    return radius_bank(min(2.0 * merging.cells * (1 + FADE), WIDEST), STEPS, shape_of(profile), slopes=slopes)
+    largest = min(2.0 * merging.cells * (1 + FADE), WIDEST)
+    knots = profile.knots.detach().double()
+    return _kept_bank(tuple(knots.flatten().tolist()), float(profile.bulge), largest, slopes)
+
+
+@lru_cache(maxsize=4)
+def _kept_bank(knots: tuple[float, ...], bulge: float, largest: float, slopes: bool) -> RadiusBank:
+    """Drawn once for the pictures of a sequence; a few megabytes."""
+    sizes = torch.tensor(knots, dtype=torch.float64).reshape(-1, 3), torch.tensor(bulge, dtype=torch.float64)
+    return radius_bank(largest, shape_of(Profile(*sizes)), slopes=slopes)
 
 
 def splat_merged(

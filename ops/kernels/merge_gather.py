@@ -14,13 +14,22 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge import bank_for, cell_radius
+from torchbokeh.ops.kernels.merge import bank_for, cell_number, cell_radius
 from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, bands, classify, collect
-from torchbokeh.ops.kernels.radius_bank import RadiusBank, draw_psf, draw_slopes, psf_buffer, rounded, rows_within
+from torchbokeh.ops.kernels.radius_bank import (
+    RadiusBank,
+    draw_psf,
+    draw_slopes,
+    number_of,
+    psf_buffer,
+    radius_of,
+    rounded,
+    rows_within,
+)
 from torchbokeh.ops.kernels.rows import gather_rows
 from torchbokeh.ops.kernels.splat import clamped, row_range
 from torchbokeh.ops.merge import MARGIN, Merging
-from torchbokeh.ops.spans import MIN_RADIUS, Profile
+from torchbokeh.ops.spans import Profile
 from torchbokeh.ops.system.threads import run_all
 
 
@@ -121,7 +130,7 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
 
     ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the level.
     """
-    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, bank_rows = bank
     cells, across, start = levels.cells, levels.sizes[level, 1], levels.sizes[level, 2]
     in_bank = mirrored if mirrored else len(firsts)
     height, stride = sums.shape[0], 4 * sums.shape[1]
@@ -135,15 +144,15 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
             if cells[p + 4] == 0.0:
                 continue
             smaller = cell_radius(cells, p, scale)
-            radius = np.rint(bank_steps * smaller)
-            if radius < in_bank:
-                k = int(radius)
+            number = cell_number(smaller)
+            if number < in_bank:
+                k = int(number)
                 if cells[p + 6] < 0.0:
                     k += mirrored
                 first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
                 gather_rows(sums, first * stride + 4 * (pad + MARGIN + i), stride, bank_rows, span, found)
             else:
-                coc = math.copysign(radius / bank_steps, cells[p + 6])
+                coc = math.copysign(radius_of(number), cells[p + 6])
                 _gather_wide(sums, pad, i + MARGIN, y, coc, buffer, found)
             slope = 0.0
             for k in range(4):
@@ -173,7 +182,7 @@ def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: 
     grad_values, grad_coc, grad_weight = grads
     channel, constant = lanes.channel, lanes.constant
     thresholds, sizes, cells = levels.thresholds, levels.sizes, levels.cells
-    shape, bank_steps, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, bank_rows = bank
     in_bank = mirrored if mirrored else len(firsts)
     height, width = coc.shape
     stride = 4 * sums.shape[1]
@@ -196,16 +205,16 @@ def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: 
                     grad[4] += w * whole * cells[p + 4]
             lowest = _lowest_share(level, share)
             if lowest > 0.0:
-                radius = np.rint(bank_steps * abs(signed))
-                if radius < in_bank:
-                    k = int(radius)
+                number = number_of(abs(signed))
+                if number < in_bank:
+                    k = int(number)
                     if signed < 0.0:
                         k += mirrored
                     first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
                     gather_rows(sums, first * stride + 4 * (pad + x), stride, bank_rows, span, found)
                 else:
-                    _gather_wide(sums, pad, x, y, rounded(signed, bank_steps), buffer, found)
-                moves = radius > bank_steps * MIN_RADIUS
+                    _gather_wide(sums, pad, x, y, rounded(signed), buffer, found)
+                moves = number > 0.0
                 for k in range(4):
                     grad[k] += lowest * found[k]
                     if moves:

@@ -8,17 +8,20 @@ import numpy as np
 
 from torchbokeh.ops.kernels.rows import PsfRows
 from torchbokeh.ops.kernels.splat import Shape, row_slopes, row_table
+from torchbokeh.ops.merge import EVEN, STEPS
 from torchbokeh.ops.spans import MIN_RADIUS
+
+LAST = EVEN * EVEN * (1.0 / MIN_RADIUS - 1.0 / EVEN)
+"""Number of the PSF with the radius `EVEN`, in units of `STEPS`."""
 
 
 class RadiusBank(NamedTuple):
-    """PSFs of the radii ``0, 1/steps, 2/steps, ...``, first for positive CoC, then for negative.
+    """PSFs of the radii ``radius_of(0), radius_of(1), ...``, first for positive CoC, then for negative.
 
     PSF ``k`` has the rows ``ends[k] .. ends[k+1]-1``, from row ``firsts[k]`` relative to its centre.
 
     Attributes:
         shape: what PSFs of other radii are drawn from.
-        steps: radii per pixel.
         mirrored: where the PSFs of negative CoC start; 0 if they are those of positive CoC.
         reach: columns left and right of a centre that any PSF stays within.
         firsts: ``(N,)``.
@@ -27,7 +30,6 @@ class RadiusBank(NamedTuple):
     """
 
     shape: Shape
-    steps: int
     mirrored: int
     reach: int
     firsts: np.ndarray
@@ -51,9 +53,22 @@ def psf_buffer(shape, n):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(inline="always")
-def rounded(coc, steps):  # type: ignore[no-untyped-def]
+def number_of(radius):  # type: ignore[no-untyped-def]
+    """The number of the PSF in a bank that stands for a radius, as a float: see `torchbokeh.ops.merge.rounded`."""
+    graded = 1.0 / MIN_RADIUS - 1.0 / min(max(radius, MIN_RADIUS), EVEN)
+    return np.rint(STEPS * (EVEN * EVEN * graded + max(radius - EVEN, 0.0)))
+
+
+@nb.njit(inline="always")
+def radius_of(number):  # type: ignore[no-untyped-def]
+    """The radius of a PSF of a bank, at least `MIN_RADIUS`."""
+    return 1.0 / (1.0 / MIN_RADIUS - min(number / STEPS, LAST) / (EVEN * EVEN)) + max(number / STEPS - LAST, 0.0)
+
+
+@nb.njit(inline="always")
+def rounded(coc):  # type: ignore[no-untyped-def]
     """The CoC with its radius rounded to one that a bank would hold."""
-    return math.copysign(np.rint(steps * abs(coc)) / steps, coc)
+    return math.copysign(radius_of(number_of(abs(coc))), coc)
 
 
 @nb.njit(inline="always")
@@ -105,36 +120,36 @@ def draw_slopes(coc, x, first, n, borders, buffer):  # type: ignore[no-untyped-d
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_all(count, steps, shape, sign, with_slopes):  # type: ignore[no-untyped-def]
+def _draw_all(count, shape, sign, with_slopes):  # type: ignore[no-untyped-def]
     shapes, s = shape.tables, 1 if sign < 0.0 else 0
     ends, firsts = np.zeros(count + 1, np.int64), np.zeros(count, np.int64)
     for k in range(count):
-        r = max(k / steps, MIN_RADIUS)
+        r = radius_of(k)
         # A row that is only touched holds nothing: a PSF of half a pixel is one row.
         firsts[k] = math.ceil(r * shapes[s, 0, 0] - 0.5 + 1e-9)
         ends[k + 1] = ends[k] + math.floor(r * shapes[s, -1, 0] + 0.5 - 1e-9) - firsts[k] + 1
     columns, weights = np.empty((ends[-1], 2), np.int64), np.empty((ends[-1], 4), np.float64)
     slopes = np.zeros((ends[-1] if with_slopes else 0, 4), np.float64)
-    table = np.empty((7, int(2 * count / steps) + 8), np.float64)
+    table = np.empty((7, int(2 * radius_of(count)) + 8), np.float64)
     for k in range(count):
-        coc = sign * max(k / steps, MIN_RADIUS)
+        coc = sign * radius_of(k)
         a, b = ends[k], ends[k + 1]
         first, n, borders = firsts[k], b - a, (-1e9, 1e9)
         psf = PsfBuffer(shape, table, PsfRows(columns[a:b], weights[a:b], slopes[a:b]))
         draw_psf(coc, 0.5, first, n, borders, psf)
-        if with_slopes and k / steps > MIN_RADIUS:
+        if with_slopes and k > 0:
             draw_slopes(coc, 0.5, first, n, borders, psf)
     return firsts, ends, columns, weights, slopes
 
 
-def radius_bank(largest: float, steps: int, shape: Shape, *, slopes: bool = False) -> RadiusBank:
+def radius_bank(largest: float, shape: Shape, *, slopes: bool = False) -> RadiusBank:
     """Draw the PSFs of all radii up to ``largest``."""
-    count = math.ceil(largest * steps) + 1
+    count = int(number_of(largest)) + 1
     symmetric = bool(np.abs(shape.tables[0, :, :3] - shape.tables[1, :, :3]).max() < 1e-14)
-    firsts, ends, *rows = _draw_all(count, steps, shape, 1.0, slopes)
+    firsts, ends, *rows = _draw_all(count, shape, 1.0, slopes)
     if not symmetric:
-        behind, stops, *others = _draw_all(count, steps, shape, -1.0, slopes)
+        behind, stops, *others = _draw_all(count, shape, -1.0, slopes)
         firsts, ends = np.concatenate([firsts, behind]), np.concatenate([ends, stops[1:] + ends[-1]])
         rows = [np.concatenate(pair) for pair in zip(rows, others, strict=True)]
     reach = math.ceil(largest) + 2
-    return RadiusBank(shape, steps, 0 if symmetric else count, reach, firsts, ends, PsfRows(*rows))
+    return RadiusBank(shape, 0 if symmetric else count, reach, firsts, ends, PsfRows(*rows))

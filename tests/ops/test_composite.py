@@ -47,6 +47,15 @@ def test_known_values_are_kept_to_the_bit(size: tuple[int, int], dtype: torch.dt
     assert torch.equal(pull_push(values, torch.ones_like(weight)), values)
 
 
+@pytest.mark.parametrize("size", [*SIZES, (64, 96), (99, 151), (5, 1023)])
+def test_a_flipped_or_transposed_picture_is_filled_alike(size: tuple[int, int]) -> None:
+    values, weight = holes(2, 2, *size, seed=6, share=0.1)
+    filled = pull_push(values, weight)
+    for dim in (2, 3):
+        torch.testing.assert_close(pull_push(values.flip(dim), weight.flip(dim)).flip(dim), filled, rtol=0, atol=1e-12)
+    torch.testing.assert_close(pull_push(values.mT, weight.mT).mT, filled, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_one_known_pixel_fills_everything(size: tuple[int, int]) -> None:
     values, weight = holes(1, 2, *size, seed=size[0] * size[1] // 2, share=0.0)
