@@ -70,10 +70,10 @@ def _doubled(t: Tensor, dim: int, n: int) -> Tensor:
         return t
     after = torch.cat([t.narrow(dim, 1, m - 1), t.narrow(dim, m - 1, 1)], dim)
     if n % 2:
-        pair = [t, torch.lerp(t, after, 0.5)]
+        pair = [t, t + 0.5 * (after - t)]  # not lerp, which rounds by where threads divide the work
     else:
         before = torch.cat([t.narrow(dim, 0, 1), t.narrow(dim, 0, m - 1)], dim)
-        pair = [torch.lerp(t, side, 0.25) for side in (before, after)]
+        pair = [t + 0.25 * (side - t) for side in (before, after)]
     return torch.stack(pair, dim + 1).flatten(dim, dim + 1).narrow(dim, 0, n)
 
 

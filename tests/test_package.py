@@ -187,11 +187,11 @@ def test_no_module_imports_itself_in_a_circle() -> None:
     assert imports == {}
 
 
-LONGEST_FILE, LONGEST_FUNCTION, MOST_ARGUMENTS = 400, 60, 12
+LONGEST_FILE, LONGEST_FUNCTION, MOST_ARGUMENTS, MOST_SETTINGS = 400, 60, 10, 15
 
 
 def test_files_and_functions_are_short() -> None:
-    """Docstrings are not counted. Constructors of public modules have the most arguments: they name every setting."""
+    """Docstrings are not counted, and constructors may have more arguments: they name every setting."""
     long = {}
     for name, file in _modules().items():
         source = file.read_text(encoding="utf-8")
@@ -205,7 +205,8 @@ def test_files_and_functions_are_short() -> None:
             start = (first.end_lineno or 0) + 1 if said else first.lineno
             lines = (node.end_lineno or 0) - start + 1
             arguments = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
-            if lines > LONGEST_FUNCTION or arguments > MOST_ARGUMENTS:
+            most = MOST_SETTINGS if node.name == "__init__" else MOST_ARGUMENTS
+            if lines > LONGEST_FUNCTION or arguments > most:
                 long[f"{name}.{node.name}"] = max(lines, arguments)
     assert long == {}
 

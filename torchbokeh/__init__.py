@@ -7,13 +7,13 @@ Names are imported when they are first used: ``import torchbokeh`` by itself doe
 
 from importlib.util import find_spec as _find_spec
 
-import lazy_loader as _lazy
-
 if _find_spec("torchbokeh.ops") is None or _find_spec("torchbokeh.psfs") is None:
     raise ImportError(
         "torchbokeh was imported from a source folder without its parts torchbokeh.ops and torchbokeh.psfs; "
         "install it with `pip install -e .`, start Python in another folder, or use the command `torchbokeh`"
     )
+
+import lazy_loader as _lazy
 
 __version__ = "0.1.0"
 

@@ -151,7 +151,7 @@ def test_ctrl_c_at_any_moment(folder: Path, command: str, seconds: float) -> Non
 
 def test_ctrl_c_while_importing(tmp_path: Path) -> None:
     """A traceback into torch would be the answer otherwise; as a console script and by ``-m``."""
-    scripts = (["-m", "torchbokeh"], ["-c", "import sys; sys.argv[0] = 'bin/torchbokeh'; import torchbokeh"])
+    scripts = (["-m", "torchbokeh"], ["-c", "from torchbokeh.commands.entry import main; main()"])
     for script in scripts:
         process = subprocess.Popen(
             [sys.executable, "-X", "importtime", *script, "--help"],

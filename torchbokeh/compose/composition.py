@@ -94,7 +94,7 @@ def compose(
             densities = densities + vote * density
             # Where a surface is and no splat says how much it stops, the piece has no vote on what is behind either.
             absent = torch.zeros_like(known) if surface.alpha is None else (surface.alpha == 0).to(known.dtype)
-            left = left * torch.lerp(absent, 1 - stopped, known)
+            left = left * (absent + known * (1 - stopped - absent))
         density = torch.where(votes > TINY, densities / votes.clamp_min(TINY), density)
         colour = colour + density * seen
         covered = covered + density * votes

@@ -147,6 +147,15 @@ def block_means(t: Tensor, size: int) -> Tensor:
 
 
 def enlarged(t: Tensor, scale: int, size: tuple[int, ...]) -> Tensor:
-    """A picture of block means, interpolated bilinearly to ``size`` pixels."""
-    large = F.interpolate(t, scale_factor=scale, mode="bilinear", align_corners=False)
-    return large[..., : size[0], : size[1]]
+    """A picture of block means, interpolated bilinearly to ``size`` pixels.
+
+    As sums and products, whose rounding, unlike that of `F.interpolate`, does not depend on the number of threads.
+    """
+    for dim in (2, 3):
+        n = t.shape[dim]
+        before = torch.cat([t.narrow(dim, 0, 1), t.narrow(dim, 0, n - 1)], dim)
+        after = torch.cat([t.narrow(dim, 1, n - 1), t.narrow(dim, n - 1, 1)], dim)
+        places = [(k + 0.5) / scale - 0.5 for k in range(scale)]
+        parts = [t + abs(place) * ((before if place < 0 else after) - t) for place in places]
+        t = torch.stack(parts, dim + 1).flatten(dim, dim + 1)
+    return t[..., : size[0], : size[1]]

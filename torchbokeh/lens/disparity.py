@@ -82,6 +82,7 @@ class DisparityLens(Lens):
             ValueError: wrong shape or device, or ``width`` < 1.
 
         Example:
+            >>> import torch
             >>> DisparityLens(30.0, focus_disparity=0.5).depth(torch.tensor([[15.0]]), width=640).item()
             0.0
         """

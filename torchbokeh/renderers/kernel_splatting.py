@@ -133,11 +133,13 @@ class KernelSplatting(nn.Module):
             ValueError: shapes, devices or values do not fit: see the message.
         """
         request = self.request(image, coc, depth=depth, motion=motion)
-        pictures = []
-        for one in [request] if plan is not None else request.items():
-            own = self.decide(one) if plan is None else fitting(plan, SplattingPlan, one)
-            pieces = self.pieces(own)
-            pictures.append(one.answered(self.paint(one, own, pieces), *pieces[1][0]))
+        requests = request.items() if plan is None else [request]
+        plans = [self.decide(one) if plan is None else fitting(plan, SplattingPlan, one) for one in requests]
+        shapes = [self.pieces(own) for own in plans]
+        pictures = [
+            one.answered(self.paint(one, own, pieces), *pieces[1][0])
+            for one, own, pieces in zip(requests, plans, shapes, strict=True)
+        ]
         return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
 
     def request(

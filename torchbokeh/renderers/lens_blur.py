@@ -1,5 +1,7 @@
 """The front door: image and depth in, the picture a lens would take out."""
 
+import sys
+
 import torch
 from torch import Tensor, nn
 
@@ -103,13 +105,13 @@ class LensBlur(nn.Module):
         check_choice("shutter", shutter, ADVANCE)
         self.lens = lens
         self.aperture = parse_aperture(aperture)
-        self.layers = _count("layers", layers, 1 << 16)
+        self.layers = _count("layers", layers)
         self.quality = quality
         self.tolerance = tolerance
         self.max_coc = max_coc
         self.subapertures = _count("subapertures", subapertures, MOST)
         self.shutter = shutter
-        self.margin = check_whole("margin", margin, 0, 1 << 27)
+        self.margin = check_whole("margin", margin, 0)
 
     def extra_repr(self) -> str:
         """The settings, for ``print``."""
@@ -178,11 +180,13 @@ class LensBlur(nn.Module):
         request = self.request(image, depth, coc=coc, motion=motion, shutter_depth=shutter_depth, background=background)
         if image.numel() == 0:
             return request.answered(image if image.dim() == 4 else image.sum(1))
-        pictures = []
-        for one in [request] if plan is not None else request.items():
-            own = self.decide(one) if plan is None else fitting(plan, Plan, one)
-            pieces = self.pieces(own)
-            pictures.append(one.answered(self.paint(one, own, pieces), *pieces[1][0]))
+        requests = request.items() if plan is None else [request]
+        plans = [self.decide(one) if plan is None else fitting(plan, Plan, one) for one in requests]
+        shapes = [self.pieces(own) for own in plans]  # before the blur, which a compiler then sees whole
+        pictures = [
+            one.answered(self.paint(one, own, pieces), *pieces[1][0])
+            for one, own, pieces in zip(requests, plans, shapes, strict=True)
+        ]
         return torch.cat(pictures) if len(pictures) > 1 else pictures[0]
 
     def request(
@@ -244,7 +248,7 @@ class LensBlur(nn.Module):
         return Planned(self, plan)
 
 
-def _count(name: str, value: int | str, most: int) -> int | None:
+def _count(name: str, value: int | str, most: int = sys.maxsize) -> int | None:
     """A positive number, or ``None`` for ``"auto"``."""
     if isinstance(value, str) and value == "auto":
         return None

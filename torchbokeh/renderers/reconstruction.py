@@ -50,7 +50,7 @@ def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 
     """
     samples, dtype = checked_samples(samples), samples.colour.dtype
     bank = bank_of_motion(samples.colour.device) if bank is None else _checked_bank(bank)
-    check_whole("layers", layers, 1, 1 << 16)
+    check_whole("layers", layers, 1)
     low, high = samples.coc.detach().aminmax()
     bins = _splat_bins(samples, bin_centres(float(low), float(high), layers), bank)
     colour, coverage = fill_until_full([(b[:, :-1], b[:, -1:]) for b in bins])

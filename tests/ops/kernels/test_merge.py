@@ -375,7 +375,8 @@ def test_cells_are_those_of_the_definition(size: tuple[int, int], channels: int,
             with np.errstate(invalid="ignore"):
                 mean = np.nan_to_num(records[..., 5] / records[..., 4]) / 2**level
             smaller = np.sqrt(np.maximum(mean**2 - SPREAD, 0.25)) * np.where(records[..., 6] < 0, -1, 1)
-            np.testing.assert_allclose(smaller, radius[0, 0], rtol=0, atol=0.51 / STEPS)
+            # Cells are rounded to a step, and then to one of those of the bank, which are no wider.
+            np.testing.assert_allclose(smaller, radius[0, 0], rtol=0, atol=1.02 / STEPS)
     assert levels.cells.dtype == np.float32
 
 

@@ -136,7 +136,8 @@ def off(found: dict[str, Tensor], wanted: dict[str, Tensor]) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_processes_with_one_plan_have_the_gradients_of_one_process(quality: str, shares: list[Any]) -> None:
+def test_processes_have_the_gradients_of_one_process(quality: str, shares: list[Any]) -> None:
+    """With one plan for all, and with a plan of its own for every picture, which is that of the picture alone."""
     network = Network(quality)
     plan = whole_plan(network)
     assert plan.hidden == "filled"
@@ -144,10 +145,9 @@ def test_processes_with_one_plan_have_the_gradients_of_one_process(quality: str,
     wanted = gradients(network, *batch(), plan)
     assert set(wanted) == {"depth.weight", "depth.bias", "blur.lens.f_number", "blur.lens.focus_distance"}
     assert all(off(found[f"{quality}, one plan"], wanted) < 1e-5 for found in shares)
-    # The plan of the whole batch is the one that a process with all of it makes.
-    assert off(gradients(network, *batch(), None), wanted) == 0
-    # Without it, each process takes the bins that suit its own pictures.
-    assert all(1e-5 < off(found[f"{quality}, own plans"], wanted) < 0.5 for found in shares)
+    alone = gradients(network, *batch(), None)
+    assert all(off(found[f"{quality}, own plans"], alone) < 1e-5 for found in shares)
+    assert off(alone, wanted) > 1e-5  # bins follow the range of blur
 
 
 @contextmanager
@@ -172,8 +172,9 @@ def tasks() -> int:
 
 def blurred(quality: str) -> dict[str, Any]:
     """Blurred pictures and a gradient, and what threads that took."""
-    image, _ = batch()
-    coc = torch.linspace(-9, 12, SIZE[1]).expand(len(image), 1, *SIZE).contiguous().requires_grad_()
+    size = 150, SIZE[1]  # pieces of work are bands of up to 64 rows
+    image = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    coc = torch.linspace(-9, 12, SIZE[1]).expand(2, 1, *size).contiguous().requires_grad_()
     before = tasks()
     with started() as counts:
         out = tb.LensBlur(quality=quality)(image, coc=coc)

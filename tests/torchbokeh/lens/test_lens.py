@@ -382,7 +382,7 @@ BAD_ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"width": True}, TypeError, "width: expected an integer, got bool"),
     ({"max_coc": 0}, ValueError, "max_coc: expected a positive finite number of pixels, got 0"),
     ({"max_coc": INF}, ValueError, "max_coc: expected a positive finite number of pixels, got inf"),
-    ({"max_coc": "1"}, TypeError, "max_coc: expected a number, got str"),
+    ({"max_coc": "1"}, TypeError, "max_coc: expected a number, got '1'"),
 ]
 
 

@@ -236,12 +236,12 @@ def test_a_batch_with_a_lens_for_each_item(aperture: Any) -> None:
     image, depth = scene(batch=4)
     numbers, focus = torch.tensor([1.4, 2.0, 4.0, 8.0]), torch.tensor([1.0, 2.0, 3.0, torch.inf])
     blur = LensBlur(ThinLens(0.2, numbers, focus, 0.036), aperture)
-    plan = blur.plan(image, depth)
-    one_by_one = []
-    for k in range(4):
-        single = LensBlur(ThinLens(0.2, numbers[k], focus[k], 0.036), aperture)
-        one_by_one.append(single(image[k : k + 1], depth[k : k + 1], plan=plan))
-    torch.testing.assert_close(blur(image, depth), torch.cat(one_by_one), rtol=0, atol=1e-6)
+    for plan in (blur.plan(image, depth), None):
+        one_by_one = []
+        for k in range(4):
+            single = LensBlur(ThinLens(0.2, numbers[k], focus[k], 0.036), aperture)
+            one_by_one.append(single(image[k : k + 1], depth[k : k + 1], plan=plan))
+        torch.testing.assert_close(blur(image, depth, plan=plan), torch.cat(one_by_one), rtol=0, atol=1e-6)
 
 
 def test_a_batch_of_layers() -> None:

@@ -97,6 +97,21 @@ def composed(
     behind = None if background is None else (background[0].double(), background[1].double().clamp(-limit, limit))
     if not image.numel():
         return image if image.dim() == 4 else image.sum(1)
+    if len(image) > 1:  # every picture has its own plan
+        each = [slice(n, n + 1) for n in range(len(image))]
+        return torch.cat(
+            [
+                composed(
+                    blur,
+                    image[one],
+                    coc[one],
+                    [step[one] for step in steps] or None,
+                    None if ends is None else ends[one],
+                    None if behind is None else (behind[0][one], behind[1][one]),
+                )
+                for one in each
+            ]
+        )
     plan = blur.plan(image, coc=coc, motion=steps or None, shutter_depth=ends, background=behind)
     out: Tensor | float = 0.0
     for other, share in ((plan, 1 - sum(share for _, share in plan.fading)), *plan.fading):
