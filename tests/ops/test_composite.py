@@ -64,6 +64,7 @@ def test_one_known_pixel_fills_everything(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning:torch", "ignore::DeprecationWarning")  # of the compiler's own
 @pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (7, 1), (1, 8), (9, 3)])

@@ -19,8 +19,7 @@ class Quality(NamedTuple):
             from 12 to 80 px. `torchbokeh report` measures it anew.
         bins: most soft bins of a surface in a composition.
         subapertures: most pieces of the lens each way where hidden content is guessed, and where it is known.
-        coarse: hidden content is filled in blocks of pixels, and the density of splats is found in such; the foreground
-            of a plain image is one bin.
+        coarse: hidden content is filled in blocks of pixels; the foreground of a plain image is one bin.
     """
 
     name: str
@@ -37,8 +36,7 @@ class Detail(NamedTuple):
     Attributes:
         merging: how far pixels are merged by radius; ``None``: not at all.
         highest: the coarsest level that they are merged on.
-        coarse: where they are merged, find in blocks how dense the splats of a surface are; its CoC need then not be
-            continued to where it is not.
+        coarse: fill what is hidden, and continue maps of surfaces to where these are not, in blocks of pixels.
     """
 
     merging: Merging | None = None

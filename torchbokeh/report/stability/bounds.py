@@ -222,14 +222,13 @@ def far_leak(case: Case) -> float:
 DENSITY = 0.08
 """Relative L1 error of a composition of a picture of one block, and in proportion less with more of them across.
 
-Stated, not derived: twice the largest that the cases show, a picture of 2 x 2 px apart. The two fastest qualities find
-the density of a surface with holes in blocks of 4 x 4 px (`half_density`), in which no radius is
-below 2 px; it is wrong within a block of the border, and so is what a surface is taken to stop there.
+Stated, not derived, and loose: twice the largest that the cases showed, a picture of 2 x 2 px apart, when the two
+fastest qualities found the density of splats in blocks of 4 x 4 px. Only what is hidden is filled in blocks now.
 """
 
 BESIDE = 0.3
 """Of the light of the brightest pixel, where that lies within a block of the border: it is not spread over a picture of
-which a part is wrong. Stated, not derived: the largest error of a pixel that the cases show, for the reason above."""
+which a part is wrong. Stated, not derived, and loose as the one above."""
 
 BORDER = 1e-3
 """Relative L1 error where banks are integrated on a torus. Stated, not derived: four times the largest that was seen.
