@@ -1,5 +1,6 @@
 """What a renderer is asked for: a picture and its maps, checked once, with depth turned into circles of confusion."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -104,12 +105,6 @@ class Request(NamedTuple):
         """Whether the image is one of layers."""
         return self.image.dim() == 5
 
-    @property
-    def maps(self) -> list[Tensor]:
-        """All tensors that a gradient may be asked for."""
-        others = [*(self.background or ()), *(self.labels or ())]
-        return [self.image, self.coc, *self.motion.maps, *(t for t in others if t is not None)]
-
     def items(self) -> list["Request"]:
         """Those of the pictures of a batch, one by one; itself, where there is but one or none."""
         return [self] if len(self.image) < 2 else [self._item(number) for number in range(len(self.image))]
@@ -146,15 +141,15 @@ class Request(NamedTuple):
             labels=None if labels is None else Labels(*map(of, labels)),
         )
 
-    def answered(self, picture: Tensor, *parameters: Tensor) -> Tensor:
-        """The picture as the caller gets it: on the sensor, in the dtype of the image, with a gradient to every map.
+    def answered(self, picture: Tensor, unused: Sequence[Tensor | None] = ()) -> Tensor:
+        """The picture as the caller gets it: on the sensor, in the dtype of the image.
 
-        What a plan leaves out has a gradient of 0, not None: among scenes that are trained on there may be one that
-        stands still, or is sharp all over. The same holds for ``parameters``.
+        What a plan leaves out, ``unused``, has a gradient of 0, not None: among scenes that are trained on there may be
+        one that stands still, or is sharp all over.
         """
         if torch.is_grad_enabled():
-            for t in (*self.maps, *parameters):
-                if t.requires_grad:
+            for t in unused:
+                if t is not None and t.requires_grad:
                     picture = picture + t[None][:0].sum()  # nothing of it: not even what is infinite counts
         return self.sensor.crop(picture).to(self.image.dtype)
 

@@ -5,8 +5,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from torch import Tensor
+
 from torchbokeh.lens.dispersion import Light
 from torchbokeh.ops.convolve import CONVOLVE_FROM
+from torchbokeh.ops.spans import Profile
 from torchbokeh.picture.request import Request
 from torchbokeh.plan.look import Look
 from torchbokeh.plan.quality import Detail, Quality
@@ -100,6 +103,20 @@ class Plan(Look):
             yield Picture(None, self, own)
         for other, part in self.fading:
             yield from other.pictures(share * part)
+
+    def unused(self, request: Request, profile: Profile) -> list[Tensor | None]:
+        """What the picture of a request does not depend on: of its maps, and of the shape of the aperture."""
+        motion, behind = request.motion, request.background
+        found: list[Tensor | None] = [] if self.moves else [*motion.displacements]
+        if motion.shutter_coc is not None:
+            found.append(request.coc if self.approaches else motion.shutter_coc)
+        if self.hidden != "given":
+            found += behind or ()
+        if self.sharp:
+            found += [request.coc, *profile]
+        if self.layer_count and not self.layers:
+            found += [request.image, request.coc]
+        return found
 
     @property
     def cuts(self) -> list[int]:
@@ -222,6 +239,10 @@ class SplattingPlan:
     def detail(self) -> Detail:
         """How finely it is carried out."""
         return Detail(self.quality.merging, self.highest)
+
+    def unused(self, request: Request, profile: Profile) -> list[Tensor | None]:
+        """What the picture of a request does not depend on."""
+        return [request.coc, *profile] if self.sharp else []
 
     def check(self, request: Request) -> None:
         """Raise a ValueError unless the plan was made for requests like this one."""

@@ -137,7 +137,7 @@ class KernelSplatting(nn.Module):
         plans = [self.decide(one) if plan is None else fitting(plan, SplattingPlan, one) for one in requests]
         shapes = [self.pieces(own) for own in plans]
         pictures = [
-            one.answered(self.paint(one, own, pieces), *pieces[1][0])
+            one.answered(self.paint(one, own, pieces), own.unused(one, pieces[1][0]))
             for one, own, pieces in zip(requests, plans, shapes, strict=True)
         ]
         return torch.cat(pictures) if len(pictures) > 1 else pictures[0]

@@ -66,4 +66,5 @@ class Planned(nn.Module):
     def forward(self, *inputs: Tensor, **maps: Any) -> Tensor:
         """Render; arguments and result are those of the renderer, but for ``plan``."""
         request = self.renderer.request(*inputs, **maps)
-        return request.answered(self.renderer.paint(request, self.plan, self.pieces))
+        picture = self.renderer.paint(request, self.plan, self.pieces)
+        return request.answered(picture, self.plan.unused(request, self.pieces[1][0]))
