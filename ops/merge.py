@@ -38,12 +38,15 @@ from torchbokeh.ops.splat import splat_spans
 FADE = 0.125
 """Radii from one to ``1 + FADE`` times the least radius of a level belong partly to the level below."""
 
-STEPS = 64
-"""Mean radii are rounded to this fraction of a cell, and those of pixels from `EVEN` px on: few PSFs are drawn."""
+STEPS = 9216
+"""Radii in cells are rounded, so that few PSFs are drawn: small ones to steps of ``1 / radius``, this many to 1, since
+the weights of small PSFs change fast: by up to 2e-4 from one step to the next."""
 
-EVEN = 12.0
-"""Smaller radii, in cells, take steps in proportion to their square, as the weights of small PSFs change faster: by up
-to 2e-4 from one step to the next."""
+EVEN = 4.6
+"""From this radius on steps grow with its square root: half a step moves 1e-3 of the light at most."""
+
+ROUNDED_TO = 32.0
+"""Larger radii are not rounded: their PSFs are too large to be kept."""
 
 MARGIN = 2
 """Cells around the picture of a level: interpolation at the border looks beyond it."""
@@ -105,12 +108,13 @@ def level_shares(
 
 
 def rounded(radius: Tensor) -> Tensor:
-    """Radii in cells, rounded to steps (see `STEPS` and `EVEN`); those of the identity are kept."""
-    most, even = 1 / MIN_RADIUS, EVEN**2 * (1 / MIN_RADIUS - 1 / EVEN)
-    number = EVEN**2 * (most - 1 / radius.clamp(MIN_RADIUS, EVEN)) + (radius - EVEN).clamp_min(0)
-    number = (number * STEPS).round() / STEPS
-    graded = 1 / (most - number.clamp_max(even) / EVEN**2)
-    return torch.where(radius > MIN_RADIUS, graded + (number - even).clamp_min(0), radius)
+    """Radii in cells, rounded to steps (see `STEPS` and `EVEN`); those of the identity are kept, and large ones."""
+    last, root = 1 / MIN_RADIUS - 1 / EVEN, EVEN**0.5
+    above = (radius.clamp_min(EVEN).sqrt() - root) * 2 / root**3
+    number = ((1 / MIN_RADIUS - 1 / radius.clamp(MIN_RADIUS, EVEN) + above) * STEPS).round() / STEPS
+    small = 1 / (1 / MIN_RADIUS - number.clamp_max(last))
+    graded = torch.where(number < last, small, (root + (number - last) * root**3 / 2).square())
+    return torch.where((radius > MIN_RADIUS) & (radius < ROUNDED_TO), graded, radius)
 
 
 def merge_cells(
@@ -151,7 +155,7 @@ def merge_cells(
         if level:
             radius = (radius.square() - SPREAD).clamp_min(MIN_RADIUS**2).sqrt()
         exact = radius.detach().to(working_dtype(coc.device))
-        step = rounded((exact * STEPS).round() / STEPS if level else exact)
+        step = rounded(exact)
         radius = radius + (step.to(radius.dtype) - radius.detach())
         factor = share if weight is None else share * torch.where(weight > 0, weight, 0.0)
         # What is infinite stays on its own levels.

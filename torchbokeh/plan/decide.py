@@ -38,7 +38,7 @@ def decide(look: Look, settings: PlanSettings) -> Plan:
         known = float(look.layer_count > 0)
         if look.background:
             known = passed(-low, (-FOREGROUND[1], -FOREGROUND[0]))
-        for_guessed, for_known = choose(settings.quality, settings.tolerance, look.shares)[0].subapertures
+        for_guessed, for_known = choose(settings.quality, settings.tolerance, look.errors, 0.0)[0].subapertures
         cuts = [(1 - cut, 1), (cut * (1 - known), for_guessed), (cut * known, for_known)]
     else:
         cuts = [(1.0, settings.subapertures)]
@@ -79,9 +79,10 @@ def _plan(look: Look, settings: PlanSettings, pieces: int, *, splits: bool) -> P
         pieces: each way, into which the lens is cut if nothing moves.
         splits: whether a foreground is put over the rest of a plain image, if there are both.
     """
-    quality, error = choose(settings.quality, settings.tolerance, look.shares)
-    most = settings.layers or quality.bins
     low, high = look.coc_range
+    largest = max(abs(low), abs(high))
+    quality, error = choose(settings.quality, settings.tolerance, look.errors, largest)
+    most = settings.layers or quality.bins
     hidden: Hidden = "nothing"
     bins: tuple[tuple[float, ...], ...]
     start, stop = FOREGROUND
@@ -93,7 +94,6 @@ def _plan(look: Look, settings: PlanSettings, pieces: int, *, splits: bool) -> P
         bins = bin_centres(low, min(stop, high), ahead), bin_centres(max(start, low), high, most)
     else:
         bins = (bin_centres(low, high, most),)
-    largest = max(abs(low), abs(high))
     return Plan(
         **vars(look),
         sharp=largest <= MIN_RADIUS and hidden != "layers" and not look.moves,

@@ -43,7 +43,8 @@ class Plan(Look):
         aperture: the shape of the aperture, for the reader.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
+        predicted_error: largest relative L1 error of the splats against exact ones: of any picture, see `Quality`,
+            or of this one where there is a tolerance, see `torchbokeh.plan.quality.predict_errors`.
         colours: the lights that a lens with dispersion takes a picture in, one by one; none where that is not seen.
         spread: how far it spreads them in px, in radius and place.
         fading: plans with a part less, and how much their pictures count for in a mean with that of this plan: where a
@@ -173,7 +174,7 @@ class Plan(Look):
         if self.highest:
             lines.append(
                 f"Quality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
-                f"merged by radius; predicted relative error of the splats {self.predicted_error:.2g}."
+                f"merged by radius; relative error of the splats at most {self.predicted_error:.2g}."
             )
         elif self.quality.merging is not None:
             lines.append(f"Quality {self.quality.name!r}: the blur is too small for pixels to be merged.")
@@ -222,7 +223,7 @@ class SplattingPlan:
         largest: the largest radius in px.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error against the exact splat, see `Quality`.
+        predicted_error: largest relative L1 error against the exact splat, as in `Plan`.
         sharp: every radius is below half a pixel: the image passes through.
         uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
     """
@@ -261,5 +262,5 @@ class SplattingPlan:
             return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
         return (
             f"{head}\nQuality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
-            f"merged; predicted relative error {self.predicted_error:.2g}."
+            f"merged; relative error at most {self.predicted_error:.2g}."
         )

@@ -14,7 +14,7 @@ from torchbokeh.picture.motion import Motion
 from torchbokeh.picture.request import Optics, Request
 from torchbokeh.picture.sensor import Sensor
 from torchbokeh.plan.plan import SplattingPlan
-from torchbokeh.plan.quality import QUALITIES, check_quality, choose, merged_shares
+from torchbokeh.plan.quality import QUALITIES, check_quality, choose, predict_errors
 from torchbokeh.psfs.aperture import Aperture, parse_aperture
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.renderers.planned import Planned, fitting
@@ -58,7 +58,7 @@ class KernelSplatting(nn.Module):
         torch.Size([1, 3, 64, 64])
         >>> print(splatting.plan(image, coc))
         64 x 64 image, radius up to 20.0 px.
-        Quality 'balanced': blocks of up to 4 x 4 pixels are merged; predicted relative error 0.019.
+        Quality 'balanced': blocks of up to 4 x 4 pixels are merged; relative error at most 0.042.
 
         Defocus with motion:
 
@@ -169,10 +169,10 @@ class KernelSplatting(nn.Module):
         size, coc = request.sensor.size, request.coc
         if request.image.numel() == 0:
             return SplattingPlan(size, 0.0, QUALITIES[0], 0, 0.0, True)
-        look = [*coc.aminmax(), *merged_shares(coc, self.quality, self.tolerance)]
-        low, high, *shares = torch.stack(look).tolist()
+        expected = [] if self.tolerance is None else predict_errors(request.image, coc)
+        low, high, *errors = torch.stack([t.to(coc.dtype) for t in (*coc.aminmax(), *expected)]).tolist()
         largest = max(-low, high)
-        quality, error = choose(self.quality, self.tolerance, shares)
+        quality, error = choose(self.quality, self.tolerance, errors, largest)
         highest = 0 if quality.merging is None else highest_level(largest, size, quality.merging)
         if self.bank is not None:
             return SplattingPlan(size, largest, quality, highest if self.bank.model.merges else 0, error, False)
