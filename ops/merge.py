@@ -32,6 +32,7 @@ from torch.nn import functional as F
 from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_transforms
+from torchbokeh.ops.highlights import LEAST_CONTRAST, ordinary_brightness
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
@@ -56,10 +57,6 @@ SPREAD = 2 / 3
 
 FEWEST = 16
 """Cells across the longer side of the coarsest level. From there on, the height of the picture bounds the cost."""
-
-LEAST_CONTRAST = 4.0
-"""A highlight is at least this many times as bright as the mean."""
-
 
 MOST_LEVELS = 32
 
@@ -90,13 +87,11 @@ def level_shares(
 ) -> list[Tensor]:
     """Share ``(B, 1, H, W)`` of every pixel in the levels ``0 .. highest``; the shares of a pixel sum to 1.
 
-    They are a choice, not a part of the picture: no gradient runs through them. What is a highlight is told by the mean
-    of the picture, in which a pixel counts by its weight: black ones do as well, or lights before black would be none.
+    They are a choice, not a part of the picture: no gradient runs through them.
     """
     values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
     counted = torch.ones_like(values[:, :1]) if weight is None else weight.detach().to(values.dtype)
-    magnitude = torch.where(counted > 0, values.abs() * counted, 0.0)
-    mean = magnitude.sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
+    mean = ordinary_brightness(values, counted)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
     ordinary = ~(values.abs() > mean * bound).any(1, keepdim=True)
     above = [torch.ones_like(radius)]

@@ -16,12 +16,12 @@ from torch.nn import functional as F
 
 import torchbokeh.ops.merge
 from torchbokeh.ops import dispatch
+from torchbokeh.ops.highlights import LEAST_CONTRAST
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import (
     EVEN,
     FADE,
     FEWEST,
-    LEAST_CONTRAST,
     MARGIN,
     ROUNDED_TO,
     SPREAD,

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from torchbokeh.compose.exposure import Exposure
 from torchbokeh.ops.composite import TINY, pull_push
+from torchbokeh.ops.highlights import LEAST_CONTRAST, ordinary_brightness
 from torchbokeh.plan.bins import FOREGROUND
 
 COARSE = 4
@@ -118,10 +119,9 @@ def fill_hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Ten
 
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:
-    """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, far above four times the channel's mean."""
-    brightness = image.abs()
-    usual = 4 * (brightness * known).sum((2, 3), keepdim=True) / known.sum((2, 3), keepdim=True).clamp_min(TINY)
-    ratio = (brightness / usual.clamp_min(TINY)).clamp(max=1e4)  # keeps the power and its slope finite
+    """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, of which none begins abruptly."""
+    least = LEAST_CONTRAST * ordinary_brightness(image, known)
+    ratio = (image.abs() / least.clamp_min(TINY)).clamp(max=1e4)  # keeps the power and its slope finite
     return 1 / (1 + ratio**4)
 
 
