@@ -1,5 +1,6 @@
 """From a look at a scene to a plan: what is needed, and how what begins to be needed fades in."""
 
+import math
 from dataclasses import replace
 
 from torchbokeh.ops.merge import highest_level
@@ -15,6 +16,15 @@ CUT = (3.0, 4.0)
 
 HIDE = (1.0, 2.0)
 """Extent of the CoC in px between which what is in front begins to hide what is behind."""
+
+STEP = 2.0
+"""Change of a radius in px over one part of the exposure."""
+
+MOST_PARTS = 12
+"""Parts of the exposure, at most: of larger radii a larger step is not seen."""
+
+MORE = 0.25
+"""Part of a `STEP` on which one more part of the exposure comes in."""
 
 MOVE = (STILL[0], 2 * STILL[0])
 """Longest motion in px between which a picture begins to move: then, the lens is not cut."""
@@ -49,10 +59,11 @@ def decide(look: Look, settings: PlanSettings) -> Plan:
         (split, True, cuts),
     ]
     move = passed(max(look.motion, look.approach), MOVE)
+    parts = _exposure_parts(look)
     still = replace(look, motion=0.0, pan=None, approach=0.0)
     candidates = [
-        (share_moving * share_split * share_cut, _plan(seen, settings, pieces, splits=splits))
-        for share_moving, seen in ((1 - move, still), (move, look))
+        (share_moving * share_split * share_cut, _plan(seen, settings, pieces, count, splits=splits))
+        for share_moving, seen, count in ((1 - move, still, 1), *((move * share, look, n) for share, n in parts))
         for share_split, splits, pieces_of in ways
         for share_cut, pieces in pieces_of
         if share_moving * share_split * share_cut > 0
@@ -70,13 +81,24 @@ def passed(value: float, ends: tuple[float, float]) -> float:
     return min(max((value - start) / (stop - start), 0.0), 1.0)
 
 
-def _plan(look: Look, settings: PlanSettings, pieces: int, *, splits: bool) -> Plan:
+def _exposure_parts(look: Look) -> list[tuple[float, int]]:
+    """Into how many parts of constant radius the exposure is cut, and how much that counts for."""
+    if not look.approaches:
+        return [(1.0, 1)]
+    steps = min(max(look.approach / STEP, 2 - 2 * MORE), MOST_PARTS)
+    count = math.ceil(steps)
+    more = passed(steps, (count - MORE, count)) if count < MOST_PARTS else 0.0
+    return [(1 - more, count), (more, count + 1)]
+
+
+def _plan(look: Look, settings: PlanSettings, pieces: int, parts: int, *, splits: bool) -> Plan:
     """A plan by itself.
 
     Args:
         look: at the scene.
         settings: what to keep to.
         pieces: each way, into which the lens is cut if nothing moves.
+        parts: into which the exposure is cut.
         splits: whether a foreground is put over the rest of a plain image, if there are both.
     """
     low, high = look.coc_range
@@ -100,6 +122,7 @@ def _plan(look: Look, settings: PlanSettings, pieces: int, *, splits: bool) -> P
         hidden=hidden,
         bins=bins,
         subapertures=1 if look.moves else pieces,
+        parts=parts,
         aperture=settings.aperture,
         quality=quality,
         highest=0 if quality.merging is None else highest_level(largest, look.size, quality.merging),

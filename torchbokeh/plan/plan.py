@@ -1,6 +1,5 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -19,12 +18,6 @@ Hidden = Literal["nothing", "filled", "given", "layers"]
 
 Route = Literal["sharp", "uniform", "layers", "foreground", "surface"]
 
-STEP = 2.0
-"""Change of a radius in px over one part of the exposure."""
-
-MOST_PARTS = 12
-"""Parts of the exposure, at most: of larger radii a larger step is not seen."""
-
 _HIDDEN = {
     "filled": "what it hides is filled from its surroundings (pass background= if you know it)",
     "given": "what it hides comes from background=",
@@ -40,6 +33,7 @@ class Plan(Look):
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
+        parts: the exposure is cut into this many parts of constant radius.
         aperture: the shape of the aperture, for the reader.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
@@ -55,6 +49,7 @@ class Plan(Look):
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]
     subapertures: int
+    parts: int
     aperture: str
     quality: Quality
     highest: int
@@ -62,11 +57,6 @@ class Plan(Look):
     colours: tuple["Colour", ...] = ()
     spread: float = 0.0
     fading: tuple[tuple["Plan", float], ...] = ()
-
-    @property
-    def parts(self) -> int:
-        """Into how many parts of constant radius the exposure is cut."""
-        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
 
     @property
     def uniform(self) -> float | None:
