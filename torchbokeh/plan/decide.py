@@ -6,6 +6,7 @@ from dataclasses import replace
 from torchbokeh.ops.merge import highest_level
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.plan.bins import FOREGROUND, bin_centres
+from torchbokeh.plan.lights import BRIGHTER
 from torchbokeh.plan.look import Look, PlanSettings
 from torchbokeh.plan.plan import Hidden, Plan
 from torchbokeh.plan.quality import choose
@@ -61,12 +62,18 @@ def decide(look: Look, settings: PlanSettings) -> Plan:
     move = passed(max(look.motion, look.approach), MOVE)
     parts = _exposure_parts(look)
     still = replace(look, motion=0.0, pan=None, approach=0.0)
+    seen_lights = passed(look.lights, BRIGHTER)
+    around = min(math.ceil(max(-low, high) + look.motion + look.approach), min(look.size) // 2)
     candidates = [
-        (share_moving * share_split * share_cut, _plan(seen, settings, pieces, count, splits=splits))
+        (
+            share_lit * share_moving * share_split * share_cut,
+            replace(_plan(seen, settings, pieces, count, splits=splits), surrounded=px),
+        )
+        for share_lit, px in ((1 - seen_lights, 0), (seen_lights, around))
         for share_moving, seen, count in ((1 - move, still, 1), *((move * share, look, n) for share, n in parts))
         for share_split, splits, pieces_of in ways
         for share_cut, pieces in pieces_of
-        if share_moving * share_split * share_cut > 0
+        if share_lit * share_moving * share_split * share_cut > 0
     ]
     main = candidates[-1][1]  # they are ordered: each has all that those before it have
     shares: dict[Plan, float] = {}
@@ -123,6 +130,7 @@ def _plan(look: Look, settings: PlanSettings, pieces: int, parts: int, *, splits
         bins=bins,
         subapertures=1 if look.moves else pieces,
         parts=parts,
+        surrounded=0,
         aperture=settings.aperture,
         quality=quality,
         highest=0 if quality.merging is None else highest_level(largest, look.size, quality.merging),

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchbokeh.ops.spans import working_dtype
 from torchbokeh.picture.motion import Motion
 from torchbokeh.picture.request import Request
+from torchbokeh.plan.lights import lights_at_border
 from torchbokeh.plan.quality import predict_errors
 from torchbokeh.psfs.combined import STILL
 
@@ -41,6 +42,7 @@ class Look:
         motion: longest displacement in px over the open shutter.
         pan: the displacement (dx, dy) that all pixels share; None where they do not.
         approach: largest change of a signed radius in px while the shutter is open.
+        lights: how bright lights near the border are, see `torchbokeh.plan.lights.lights_at_border`.
     """
 
     size: tuple[int, int]
@@ -55,6 +57,7 @@ class Look:
     motion: float = 0.0
     pan: tuple[float, float] | None = None
     approach: float = 0.0
+    lights: float = 0.0
 
     @property
     def coc_range(self) -> tuple[float, float]:
@@ -74,7 +77,7 @@ class Look:
 
 @torch.no_grad()
 def look_at(request: Request, settings: PlanSettings) -> Look:
-    """Look at a picture, or at layers, with one small copy from the device, and at its motion with another."""
+    """Look at a picture, or at layers, with a small copy from the device for its maps, its motion and its lights."""
     image, coc = request.image, request.coc
     if image.numel() == 0:
         raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
@@ -85,7 +88,8 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
         expected = [] if settings.tolerance is None else predict_errors(image, coc)
         found = [t.to(coc.dtype) for t in (*coc.aminmax(), clamped, *expected)]
         low, high, share, *errors = torch.stack(found).tolist()
-        return Look(size, (low,), (high,), share, tuple(errors), 0, (), (), background, motion, pan, approach)
+        lights = lights_at_border(image, coc, max(-low, high), motion + approach)
+        return Look(size, (low,), (high,), share, tuple(errors), 0, (), (), background, motion, pan, approach, lights)
     there = image[:, :, 3:] > 0
     lows = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1)
     highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
@@ -99,7 +103,9 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
     opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
     ends = tuple(bounds[k] for k in kept), tuple(bounds[count + k] for k in kept)
-    return Look(size, *ends, share, tuple(errors), count, kept, opaque, background, motion, pan, approach)
+    largest = max((*map(abs, ends[0]), *map(abs, ends[1])), default=0.0)
+    lights = lights_at_border(image, torch.where(there, coc, 0.0), largest, motion + approach)
+    return Look(size, *ends, share, tuple(errors), count, kept, opaque, background, motion, pan, approach, lights)
 
 
 def _look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, float] | None, float]:

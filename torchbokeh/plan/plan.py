@@ -34,6 +34,7 @@ class Plan(Look):
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
         parts: the exposure is cut into this many parts of constant radius.
+        surrounded: the picture is surrounded with its ground, this many px on each side, for the lights at its border.
         aperture: the shape of the aperture, for the reader.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
@@ -50,6 +51,7 @@ class Plan(Look):
     bins: tuple[tuple[float, ...], ...]
     subapertures: int
     parts: int
+    surrounded: int
     aperture: str
     quality: Quality
     highest: int
@@ -140,6 +142,8 @@ class Plan(Look):
             head += f"\nDispersion spreads colours by up to {self.spread:.1f} px: {how} are blurred one by one."
         if self.sharp and not self.colours:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.surrounded:
+            head += f"\n{lights_text(self.surrounded)}"
         if self.uniform is not None:
             moved = f", moved by ({self.pan[0]:.1f}, {self.pan[1]:.1f}) px" if self.moves and self.pan else ""
             return f"{head}\nEvery pixel has the same PSF ({self.aperture}{moved}): a single convolution."
@@ -174,6 +178,11 @@ class Plan(Look):
         if self.clamped:
             lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
         return "\n".join(lines)
+
+
+def lights_text(surrounded: int) -> str:
+    """What is assumed of the surroundings, for the reader of a plan."""
+    return f"Lights near the border: {surrounded} px around the picture go on as its ground does, without lights."
 
 
 class Colour(NamedTuple):
@@ -216,6 +225,7 @@ class SplattingPlan:
         predicted_error: largest relative L1 error against the exact splat, as in `Plan`.
         sharp: every radius is below half a pixel: the image passes through.
         uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
+        surrounded: as in `Plan`; and ``lit``, how much the picture with surroundings counts for.
     """
 
     size: tuple[int, int]
@@ -225,6 +235,8 @@ class SplattingPlan:
     predicted_error: float
     sharp: bool
     uniform: float | None = None
+    surrounded: int = 0
+    lit: float = 0.0
 
     @property
     def detail(self) -> Detail:
@@ -246,6 +258,8 @@ class SplattingPlan:
         head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
         if self.sharp:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.lit:
+            head += f"\n{lights_text(self.surrounded)}"
         if self.uniform is not None:
             return f"{head}\nEvery pixel has the same PSF: a single convolution."
         if self.highest == 0:
