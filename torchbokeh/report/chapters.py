@@ -9,7 +9,6 @@ from torchbokeh.report.experiment import Figures
 from torchbokeh.report.psfs import chapter as psfs
 from torchbokeh.report.settings import Settings, Sizes
 from torchbokeh.report.stability import chapter as stability
-from torchbokeh.report.stability import tables as stability_tables
 from torchbokeh.report.write import write_together
 
 
@@ -34,7 +33,7 @@ class Chapter(NamedTuple):
 REPORT = Chapter("report", Settings, run.run_experiments, tables.markdown, plots.draw)
 PSFS = Chapter("psfs", psfs.PsfSettings, psfs.analyse, psfs.markdown, psfs.draw)
 STABILITY = Chapter(
-    "stability", stability.StabilitySettings, stability.run_stability, stability_tables.markdown, stability_tables.draw
+    "stability", stability.StabilitySettings, stability.run_stability, stability.markdown, stability.draw
 )
 
 
