@@ -7,7 +7,6 @@ What is renamed or moved inside the package is renamed here. ``torchbokeh.ops`` 
 from torchbokeh.banks.highlights import BRIGHT
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
 from torchbokeh.learn.export import OPSET
-from torchbokeh.lens.dispersion import FEWEST, SEEN, Spectrum
 from torchbokeh.ops.splat import _splat_spans_torch as splat_definition
 from torchbokeh.picture.samples import pixel_positions
 from torchbokeh.picture.sensor import STEPS as STEPS_OF_VIEWS

@@ -20,7 +20,6 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Dispersion against the truth",
         "Dispersion: run time against views",
         "Dispersion: bands of colour",
-        "Dispersion: importance sampling",
         "What a plan leaves out",
         "What the methods are",
     ]

@@ -11,7 +11,6 @@ from torchbokeh.report.rows import Row, Say, distinct, of
 from torchbokeh.report.settings import Sizes, sized
 from torchbokeh.report.stability import checks
 from torchbokeh.report.stability.pictures import highlight_rows, render_rows
-from torchbokeh.report.stability.sweeps import plan_rows, sweep_rows
 
 FORMAT = 2
 """Of ``stability.json``; it goes up when the meaning of a field changes."""
@@ -45,8 +44,7 @@ class StabilitySettings(Sizes):
 PARTS: dict[str, Callable[[StabilitySettings], Iterable[Row]]] = {
     "pictures through renderers": lambda s: render_rows(s.side, names=s.renderers),
     "highlights": lambda s: highlight_rows(s.wide, s.field, s.renderers),
-    "sweeps of radii": lambda s: sweep_rows(s.side),
-    "changes of plans": lambda s: plan_rows(s.wide // 2),
+    "sweeps of radii": lambda s: checks.sweep_rows(s.side),
     "lenses": lambda s: checks.lens_rows(s.side),
     "layers": lambda s: checks.layer_rows(s.side),
     "scenes": lambda s: checks.scene_rows(s.side),

@@ -1,8 +1,9 @@
-"""Stiff cases of single parts: lenses, layers, scenes, iteration, gradients and large pictures."""
+"""Stiff cases of single parts: lenses, sweeps of radii, layers, scenes, iteration, gradients and large pictures."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -10,8 +11,11 @@ from torch import Tensor
 
 import torchbokeh
 from torchbokeh import AccumulationBuffer, ChromaticAccumulation, Dispersion, KernelSplatting, LensBlur
+from torchbokeh.ops.merge import FADE, STEPS
+from torchbokeh.report.internals import QUALITIES
 from torchbokeh.report.rows import Row
 from torchbokeh.report.scenes import with_dispersion
+from torchbokeh.report.stability.bounds import coverage, lipschitz
 from torchbokeh.report.stability.cases import even, slope, texture
 from torchbokeh.report.stability.pictures import CONSTANT, OUTSIDE, STRANGE, off, outside, row, strange
 from torchbokeh.report.stability.renderers import VIEWS
@@ -31,6 +35,10 @@ LENSES = {
 
 CHOSEN = ("coins", "whirl", "sky")
 """Recipes: highlights at many depths, fast rotation, and a backdrop at infinity."""
+
+
+STEP = 1 / STEPS
+"""Change of all radii in px: that of merged ones in cells, so that each step shows."""
 
 
 def lens_rows(side: int) -> Iterator[Row]:
@@ -62,6 +70,33 @@ def _sound(renderer: str, case: str, out: Tensor, image: Tensor) -> Iterator[Row
 def _outside(out: Tensor, image: Tensor) -> float:
     """How far a picture is outside of the range of another, at most."""
     return float(outside(out, image.min(), image.max()).max())
+
+
+def sweep_rows(side: int) -> Iterator[Row]:
+    """Even radii around 1/2 px, the FFT's first radius, and the borders of levels: no jump beyond the Lipschitz bound.
+
+    Merged radii are rounded to 1/64 of a cell, so that the picture moves in steps: the change of the radius counts as
+    one step more. Between two levels, whose pictures differ by no more than the contrast, a pixel passes within `FADE`.
+    """
+    image = texture(side, side)
+    contrast = float(image.max() - image.min())
+    for quality in QUALITIES:
+        blur, merging = KernelSplatting(quality=quality.name), quality.merging
+        radii = [0.5, 3.0, 8.0]
+        if merging is not None:
+            radii += [2 * merging.cells, 2 * merging.cells * (1 + FADE), 4 * merging.cells]
+        for radius in dict.fromkeys(radii):
+            coc = slope(side, side, radius, radius)
+            near = [blur(image, coc + k * STEP) for k in (-2, -1, 0, 1, 2)]
+            change = max(off(b, a) for a, b in pairwise(near))
+            step, fade = STEP, 0.0
+            if merging is not None:
+                level = max(radius / merging.cells, 1.0)
+                step += level / STEPS
+                fade = STEP / (FADE * merging.cells * level) * contrast
+            limit = lipschitz(contrast, radius, float(coverage(coc).min())) * step + fade
+            case = f"sweep: {radius:.4g} px, in steps of 1/{STEPS} px"
+            yield row(f"KernelSplatting, {quality.name}", case, "float64", "largest change", change, limit)
 
 
 def layer_rows(side: int) -> Iterator[Row]:
