@@ -27,7 +27,6 @@ class StabilitySettings(Sizes):
         wide: of those of single parts.
         field: side of a square of highlights in px.
         times: how often a blur is applied to its result.
-        steps: of gradient descent.
         large: height and width of large pictures.
         renderers: names of those that pictures go through; all where there are none.
     """
@@ -36,7 +35,6 @@ class StabilitySettings(Sizes):
     wide: int = 96
     field: int = 100
     times: int = sized(100, 4)
-    steps: int = sized(1000, 5)
     large: tuple[tuple[int, int], ...] = sized(((64, 8192), (4096, 4096)), ((16, 256),))
     renderers: tuple[str, ...] = sized((), ("KernelSplatting, exact", "LensBlur image, balanced"))
 
@@ -50,7 +48,6 @@ PARTS: dict[str, Callable[[StabilitySettings], Iterable[Row]]] = {
     "scenes": lambda s: checks.scene_rows(s.side),
     "iteration": lambda s: checks.iteration_rows(s.side, s.times),
     "gradients": lambda s: checks.gradient_rows(s.side),
-    "gradient descent": lambda s: checks.descent_rows(s.side, s.steps),
     "large pictures": lambda s: (row for size in s.large for row in checks.large_rows(*size)),
 }
 """All kinds of cases, in the order in which they are run."""

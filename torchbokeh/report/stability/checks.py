@@ -198,27 +198,6 @@ def gradient_rows(side: int) -> Iterator[Row]:
                     yield row(*here, "slope to the CoC", off(found[1], 0.0), 0)
 
 
-def descent_rows(side: int, steps: int = 1000) -> Iterator[Row]:
-    """Gradient descent to a blurred picture's CoC and colours: stays finite, and does not end above where it began."""
-    want_image, want_coc = texture(side, side).float(), slope(side, side, -4.0, 6.0).float()
-    for quality in BLURRED:
-        blur = LensBlur(quality=quality)
-        aim = blur(want_image, coc=want_coc).detach()
-        leaves = [torch.ones_like(want_image).requires_grad_(), torch.full_like(want_coc, 1.0).requires_grad_()]
-        adam = torch.optim.Adam(leaves, lr=0.02)
-        losses = []
-        for _ in range(steps):
-            loss = (blur(leaves[0], coc=leaves[1]) - aim).square().mean()
-            adam.zero_grad()
-            loss.backward()
-            adam.step()
-            losses.append(loss.item())
-        odd = sum(strange(t.detach(), t.dtype) for t in (*leaves, torch.tensor(losses)))
-        here = (f"LensBlur image, {quality}", f"gradient: {steps} steps of Adam", "float32")
-        yield row(*here, "not finite", odd, 0)
-        yield row(*here, "loss at the end", losses[-1], losses[0])
-
-
 def large_rows(height: int, width: int) -> Iterator[Row]:
     """Large pictures: all finite, and a constant stays constant."""
     coc = slope(height, width, -4.0, 12.0).float()
