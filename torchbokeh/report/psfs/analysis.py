@@ -60,7 +60,7 @@ class PsfSettings(Sizes):
     """
 
     psfs: int = sized(32, 3)
-    support: tuple[int, int] = sized((100, 25_000), (100, 1000))
+    support: tuple[int, int] = sized((100, 25_000), (100, 300))
     ablated: int = sized(12, 1)
     sizes: tuple[tuple[float, float, float, float], ...] = sized(
         ((25, 25, 50, 50), (50, 40, 50, 128), (100, 55, 100, 128)), ((6, 3, 6, 10),)
