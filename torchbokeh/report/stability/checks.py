@@ -78,7 +78,7 @@ def sweep_rows(side: int) -> Iterator[Row]:
     Merged radii are rounded to 1/64 of a cell, so that the picture moves in steps: the change of the radius counts as
     one step more. Between two levels, whose pictures differ by no more than the contrast, a pixel passes within `FADE`.
     """
-    image = texture(side, side)
+    image = texture(side, side).float()
     contrast = float(image.max() - image.min())
     for quality in QUALITIES:
         blur, merging = KernelSplatting(quality=quality.name), quality.merging
@@ -86,7 +86,7 @@ def sweep_rows(side: int) -> Iterator[Row]:
         if merging is not None:
             radii += [2 * merging.cells, 2 * merging.cells * (1 + FADE), 4 * merging.cells]
         for radius in dict.fromkeys(radii):
-            coc = slope(side, side, radius, radius)
+            coc = even(side, side, radius).float()
             near = [blur(image, coc + k * STEP) for k in (-2, -1, 0, 1, 2)]
             change = max(off(b, a) for a, b in pairwise(near))
             step, fade = STEP, 0.0
@@ -96,7 +96,7 @@ def sweep_rows(side: int) -> Iterator[Row]:
                 fade = STEP / (FADE * merging.cells * level) * contrast
             limit = lipschitz(contrast, radius, float(coverage(coc).min())) * step + fade
             case = f"sweep: {radius:.4g} px, in steps of 1/{STEPS} px"
-            yield row(f"KernelSplatting, {quality.name}", case, "float64", "largest change", change, limit)
+            yield row(f"KernelSplatting, {quality.name}", case, "float32", "largest change", change, limit)
 
 
 def layer_rows(side: int) -> Iterator[Row]:
