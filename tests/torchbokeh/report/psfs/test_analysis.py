@@ -46,7 +46,11 @@ def silent(line):
 
 @pytest.fixture(scope="module")
 def found():
-    return analyse(PsfSettings.quick(), silent)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)  # as tests do: see the conftest of all
+    quick = analyse(PsfSettings.quick(), silent)
+    torch.set_num_threads(before)
+    return quick
 
 
 @pytest.fixture(scope="module")
