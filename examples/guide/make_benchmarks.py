@@ -13,7 +13,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from torchbokeh.report.tables import markdown
+from torchbokeh.report.chapter import markdown
 
 HERE = Path(__file__).parent
 PAGE = HERE / "benchmarks.md"

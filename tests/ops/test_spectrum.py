@@ -255,6 +255,20 @@ def test_samples_are_where_the_weight_is() -> None:
     )
 
 
+def test_importance_takes_noise_away() -> None:
+    """Of a dot that is a disc whose radius depends on the wavelength, under a peaked weight, at equal samples."""
+    at = torch.arange(64, dtype=F64) - 31.5
+    away, variances = torch.hypot(at, at[:, None]), []
+    for importance in (True, False):
+        pictures = []
+        for seed in range(16):
+            wavelength, rgb = spectral_samples(halton(64, seed=seed)[:, 4], peak(480, 20), importance=importance)
+            radii = (10 + (650 - wavelength) / 35)[:, None, None]
+            pictures.append(torch.einsum("kc,khw->chw", rgb, (radii - away + 0.5).clamp(0, 1) / radii.square()))
+        variances.append(torch.stack(pictures).var(0).mean())
+    assert variances[0] < 0.3 * variances[1]
+
+
 def test_a_flat_weight_spreads_samples_evenly() -> None:
     for importance in (True, False):
         wavelength = spectral_samples(even(8), importance=importance)[0]

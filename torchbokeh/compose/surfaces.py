@@ -20,6 +20,9 @@ from torchbokeh.plan.bins import FOREGROUND
 COARSE = 4
 """Where pixels are merged, what is hidden is filled in blocks of this many pixels each way."""
 
+CLIPPED = 3
+"""How often what is ordinary at a border is found anew, so that none of many lights there hides another."""
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -118,23 +121,27 @@ def fill_hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     return pull_push(*planes).reshape(image.shape), pull_push(coc, weight)
 
 
-def filled_around(image: Tensor, known: Tensor, *, together: bool = False) -> Tensor:
-    """A picture ``(B, C, H, W)``, filled where ``known (B, 1, H, W)`` is 0 from where it is 1, without highlights.
+def with_ground_around(image: Tensor, width: int, *, together: bool = False) -> Tensor:
+    """A picture ``(B, C, H, W)`` and ``width`` px on each side, in which its border goes on without its highlights.
 
     Args:
-        image: the picture; 0 where it is not known.
-        known: where it is.
-        together: fill all channels from the same pixels, so that colours fit their coverage.
+        image: the picture.
+        width: px.
+        together: the last channel is a coverage: what is left out of a colour is left out of all.
     """
-    share = block_means(known, COARSE)
-    blocks = block_means(image, COARSE) / share.clamp_min(TINY)
-    ordinary = _ordinary(blocks, share)
+    least = LEAST_CONTRAST * ordinary_brightness(image, torch.ones_like(image[:, :1]), CLIPPED)
+    ordinary = (2 - image.abs() / least.clamp_min(torch.finfo(image.dtype).tiny)).clamp(1e-9, 1)
     if together:
-        ordinary = ordinary.amin(1, keepdim=True).expand_as(blocks)
-    weight = torch.maximum(share * ordinary, 1e-9 * share)
-    planes = (t.flatten(0, 1)[:, None] for t in (blocks, weight))
-    around = enlarged(pull_push(*planes).reshape(blocks.shape), COARSE, image.shape[2:])
-    return torch.where(known > 0, image, around)
+        ordinary = ordinary[:, :-1].amin(1, keepdim=True).expand_as(image)
+    share = block_means(ordinary, COARSE)
+    planes = (t.flatten(0, 1)[:, None] for t in (block_means(ordinary * image, COARSE) / share, share.clamp(max=1)))
+    ground = pull_push(*planes).reshape(share.shape)
+    blocks = -(-width // COARSE)
+    ground, start = F.pad(ground, (blocks,) * 4, mode="replicate"), blocks * COARSE - width
+    height, along = (n + 2 * width for n in image.shape[2:])
+    around = enlarged(ground, COARSE, (start + height, start + along))[..., start:, start:]
+    inside = F.pad(torch.ones_like(image[:1, :1], dtype=torch.bool), (width,) * 4)
+    return torch.where(inside, F.pad(image, (width,) * 4), around)
 
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:

@@ -7,11 +7,10 @@ its own ground, continued without its lights: then every disc is whole, and the 
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchbokeh.compose.surfaces import COARSE, continued, filled_around
+from torchbokeh.compose.surfaces import COARSE, continued, with_ground_around
 from torchbokeh.picture.request import Request
 from torchbokeh.psfs.model import Labels
 
@@ -32,13 +31,13 @@ class Surrounding(NamedTuple):
             def map_of(t: Tensor) -> Tensor:
                 return self._edges(continued(t.flatten(0, 1), alpha, COARSE)).unflatten(0, t.shape[:2])
 
-            colours = self._ground(image.flatten(0, 1), together=True).unflatten(0, image.shape[:2])
+            colours = with_ground_around(image.flatten(0, 1), self.width, together=True).unflatten(0, image.shape[:2])
             return request._replace(image=colours, coc=map_of(coc), motion=motion.mapped(map_of))
         if behind is not None:
-            behind = self._ground(behind[0]), None if behind[1] is None else self._edges(behind[1])
+            behind = with_ground_around(behind[0], self.width), None if behind[1] is None else self._edges(behind[1])
         labels = request.labels
         return request._replace(
-            image=self._ground(image),
+            image=with_ground_around(image, self.width),
             coc=self._edges(coc),
             motion=motion.mapped(self._edges),
             background=behind,
@@ -51,7 +50,3 @@ class Surrounding(NamedTuple):
 
     def _edges(self, t: Tensor) -> Tensor:
         return F.pad(t, (self.width,) * 4, mode="replicate")
-
-    def _ground(self, image: Tensor, *, together: bool = False) -> Tensor:
-        known = F.pad(torch.ones_like(image[:, :1]), (self.width,) * 4)
-        return filled_around(F.pad(image, (self.width,) * 4), known, together=together)

@@ -8,5 +8,5 @@ the last of these, and rooms of one line do not import each other:
 * `speed`, `motion`, `chromatic`, `psfs`, `stability`: the experiments, each with its tables and plots.
 * `experiments`, the table of those of ``report.md``; the other two chapters have theirs in their rooms. A new
   experiment is a file and a line in its table.
-* `run`, `tables`, `plots` and `write`, then `chapters`, then `command`.
+* `chapter` of those, and `write`, then `chapters`, then `command`.
 """

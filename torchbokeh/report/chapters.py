@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchbokeh.report import plots, run, tables
+from torchbokeh.report import chapter as report
 from torchbokeh.report.experiment import Figures
 from torchbokeh.report.psfs import chapter as psfs
 from torchbokeh.report.settings import Settings, Sizes
 from torchbokeh.report.stability import chapter as stability
-from torchbokeh.report.stability import tables as stability_tables
 from torchbokeh.report.write import write_together
 
 
@@ -31,10 +30,10 @@ class Chapter(NamedTuple):
     draw: Callable[[dict[str, Any]], Figures]
 
 
-REPORT = Chapter("report", Settings, run.run_experiments, tables.markdown, plots.draw)
+REPORT = Chapter("report", Settings, report.run_experiments, report.markdown, report.draw)
 PSFS = Chapter("psfs", psfs.PsfSettings, psfs.analyse, psfs.markdown, psfs.draw)
 STABILITY = Chapter(
-    "stability", stability.StabilitySettings, stability.run_stability, stability_tables.markdown, stability_tables.draw
+    "stability", stability.StabilitySettings, stability.run_stability, stability.markdown, stability.draw
 )
 
 

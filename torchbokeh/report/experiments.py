@@ -1,11 +1,6 @@
 """The experiments of ``torchbokeh report``: nothing else names them. A new one is a file, and a line here."""
 
-from torchbokeh.report.chromatic.experiments import (
-    DISPERSION_BANDS,
-    DISPERSION_IMPORTANCE,
-    DISPERSION_TRUTH,
-    DISPERSION_VIEWS,
-)
+from torchbokeh.report.chromatic.experiments import DISPERSION_BANDS, DISPERSION_TRUTH, DISPERSION_VIEWS
 from torchbokeh.report.experiment import Experiment
 from torchbokeh.report.motion.experiments import LIKE_LKS, MOTION
 from torchbokeh.report.speed.blur import LAYERS, LEFT_OUT, TRUTH
@@ -29,7 +24,6 @@ EXPERIMENTS: list[Experiment] = [
     DISPERSION_TRUTH,
     DISPERSION_VIEWS,
     DISPERSION_BANDS,
-    DISPERSION_IMPORTANCE,
     LEFT_OUT,
     STAGES,
 ]

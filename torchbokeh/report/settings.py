@@ -68,7 +68,6 @@ class Settings(Sizes):
         chromatic_repeat: timed runs of each method.
         sample_views: of run time against views with dispersion.
         band_views: of the dot whose bands of colour are measured.
-        importance_seeds: of the variance with importance sampling of a spectrum.
     """
 
     scenes: tuple[str, ...] = NAMES
@@ -107,4 +106,3 @@ class Settings(Sizes):
     chromatic_repeat: int = sized(2, 1)
     sample_views: tuple[int, ...] = sized((16, 64, 256, 1024), (6, 12, 24))
     band_views: int = sized(510, 96)
-    importance_seeds: int = 16

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchbokeh.report.run import run_experiments
+from torchbokeh.report.chapter import run_experiments
 from torchbokeh.report.settings import Settings
 from torchbokeh.report.speed import gradients, sweeps
 

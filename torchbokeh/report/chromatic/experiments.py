@@ -1,4 +1,4 @@
-"""The experiments on dispersion: against the truth, against the number of views, bands of colour, importance."""
+"""The experiments on dispersion: against the truth, against the number of views, bands of colour."""
 
 import math
 from collections.abc import Sequence
@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 import torchbokeh
-from torchbokeh.ops.sampling import halton
-from torchbokeh.ops.spectrum import spectral_samples
 from torchbokeh.report.experiment import Experiment, Figures
 from torchbokeh.report.markdown import pictures, row_table, seconds, section, table
 from torchbokeh.report.measure import Work, errors, measure
@@ -30,9 +28,6 @@ DOT = 128, 20.0
 
 PERIOD = 8.0
 """Changes of colour along a radius of the dot that are shorter than this, in px, count as bands."""
-
-PEAK, WIDTH, SAMPLES = 480.0, 20.0, 64
-"""Wavelength and standard deviation of the peaked equaliser in nanometres, and the samples of it."""
 
 
 def dispersing(camera: Camera, spectrum: str, axial: float, lateral: float) -> Camera:
@@ -222,38 +217,6 @@ def banding(colours: np.ndarray) -> float:
     return float(energy[quick].sum() / max(energy[~quick].sum(), 1e-30))
 
 
-def importance(settings: Settings, say: Say) -> list[Row]:
-    """Noise of a dot under a peaked equaliser, with wavelengths placed where it is and without, at equal samples.
-
-    The dot is a disc whose radius depends on the wavelength: only wavelengths are sampled. ``variance`` is over seeds,
-    the mean over pixels and channels; ``ratio`` is that without importance over that with it.
-    """
-    say("importance sampling of a spectrum")
-    size, radius = 64, 10.0
-    lens = dot_lens(size, radius / 2, "continuous")
-    at = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    away = torch.hypot(at, at[:, None])
-    variances: list[Tensor] = []
-
-    def peaked(wavelength: Tensor) -> Tensor:
-        return torch.exp(-0.5 * ((wavelength - PEAK) / WIDTH) ** 2)
-
-    for placed in (True, False):
-        pictures = []
-        for seed in range(settings.importance_seeds):
-            unit = halton(SAMPLES, seed=seed)[:, 4]
-            wavelengths, rgb = spectral_samples(unit, peaked, importance=placed)
-            shifts = torch.stack([lens.coc_shift(w, size) for w in wavelengths.tolist()]).double()
-            radii = (radius + shifts)[:, None, None]
-            pictures.append(torch.einsum("kc,khw->chw", rgb, (radii - away + 0.5).clamp(0, 1) / radii.square()))
-        variances.append(torch.stack(pictures).var(0).mean((1, 2)))
-    found, without = variances
-    channels = zip(("red", "green", "blue"), (without / found).tolist(), strict=True)
-    head = {"samples": SAMPLES, "seeds": settings.importance_seeds, "peak": PEAK, "width": WIDTH}
-    head |= {"variance": float(found.mean()), "variance_without": float(without.mean())}
-    return [{**head, "ratio": float(without.mean() / found.mean())} | {f"ratio_{c}": value for c, value in channels}]
-
-
 def _truth_section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
     size = settings["chromatic_size"]
     about = (
@@ -309,22 +272,6 @@ def _bands(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
     )
 
 
-def _importance(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
-    row = rows[0]
-    header = "without | with | ratio | red | green | blue"
-    cells = (
-        "{variance_without:.3g} | {variance:.3g} | {ratio:.3g} | {ratio_red:.3g} | {ratio_green:.3g} | {ratio_blue:.3g}"
-    )
-    return section(
-        "Dispersion: importance sampling",
-        f"A blurred dot from {row['samples']} samples of the spectrum under an equaliser that is a Gaussian about "
-        f"{row['peak']:g} nm with a standard deviation of {row['width']:g} nm. Variance over {row['seeds']} seeds, "
-        "the mean over pixels and channels, without importance and with it; their ratio, also of each channel.",
-        row_table(rows, header, cells),
-    )
-
-
 DISPERSION_TRUTH = Experiment("chromatic_truth", chromatic_truth, _truth_section, _truth_figures)
 DISPERSION_VIEWS = Experiment("chromatic_samples", chromatic_samples, _samples)
 DISPERSION_BANDS = Experiment("chromatic_bands", chromatic_bands, _bands)
-DISPERSION_IMPORTANCE = Experiment("importance", importance, _importance)

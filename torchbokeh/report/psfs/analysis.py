@@ -4,22 +4,22 @@ A PSF here is a capsule of `torchbokeh.psfs.combined.Combined` unless something 
 of points, or of squares of a quad tree, over the pixels that the dense PSF covers.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchbokeh.psfs.combined import CELLS, Combined, capsule
-from torchbokeh.psfs.model import FRAME, Symmetry
+from torchbokeh.psfs.model import FRAME, PsfModel, Symmetry, mean_picture
 from torchbokeh.psfs.quadtree import quadtree
 from torchbokeh.psfs.refit import Fit, Sparse, reconstruction, reflections
 from torchbokeh.psfs.represent import Target, candidates, laplacian, represent
 from torchbokeh.psfs.similarity import Score, centred, neighbourhood, score
 from torchbokeh.psfs.sparsify import NOISE, ablation, sparsify, voronoi_sums
-from torchbokeh.report.psfs.splats import coordinates
 from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.settings import Sizes, sized
 
@@ -57,15 +57,10 @@ class PsfSettings(Sizes):
         large: radii and lengths in px of the large PSFs.
         cells: of the grids that are compared.
         coordinates: of PSFs that each of these grids is asked for.
-        far: samples of each bank whose far field is looked at.
-        turned: samples that are turned.
-        angles: by which they are turned, from 0 to 45 degrees.
-        splats: of the sum of many.
-        reach: of the largest sample that is turned, in px.
     """
 
     psfs: int = sized(32, 3)
-    support: tuple[int, int] = sized((100, 25_000), (100, 1000))
+    support: tuple[int, int] = sized((100, 25_000), (100, 300))
     ablated: int = sized(12, 1)
     sizes: tuple[tuple[float, float, float, float], ...] = sized(
         ((25, 25, 50, 50), (50, 40, 50, 128), (100, 55, 100, 128)), ((6, 3, 6, 10),)
@@ -76,11 +71,6 @@ class PsfSettings(Sizes):
     )
     cells: tuple[int, ...] = sized((CELLS // 8, CELLS // 4, CELLS // 2, CELLS), (10, 20))
     coordinates: int = sized(200, 3)
-    far: int = sized(60, 4)
-    turned: int = sized(16, 2)
-    angles: int = sized(7, 3)
-    splats: int = sized(200, 10)
-    reach: int = sized(40, 12)
 
 
 @lru_cache(maxsize=1)
@@ -233,3 +223,57 @@ def large(settings: PsfSettings, say: Say) -> list[Row]:
         row["best"] = quality(psf, elimination.within(covered)).ssim
         rows.append(row)
     return rows
+
+
+def coordinates(model: PsfModel) -> Iterator[tuple[float, ...]]:
+    """Random coordinates without end, spread as the samples are: a box of the grid, and a place in it."""
+    draw = np.random.default_rng(SEED)
+    boxes = np.array(model.grid.boxes(), dtype=np.float64)
+    while True:
+        place = draw.uniform(*boxes[draw.integers(len(boxes))])
+        yield tuple(model.grid.unmap(torch.from_numpy(place)).tolist())
+
+
+def with_cells(cells: int) -> Combined:
+    """`Combined` on a grid of another resolution."""
+    model = Combined()
+    model.axes = tuple(replace(axis, cells=cells) for axis in model.axes)
+    return model
+
+
+def sample_count(count: int, cells: Sequence[int], say: Say) -> list[Row]:
+    """Mean similarity of the dense PSF at the same random coordinates with what grids have for it.
+
+    That is the sample of its box, taken in the middle or pre-filtered, or linear interpolation between the middles.
+
+    Args:
+        count: coordinates, spread as the samples are.
+        cells: of each grid along each axis.
+        say: is told in a line what comes next.
+    """
+    rows = []
+    draw = coordinates(Combined())
+    places = [next(draw) for _ in range(count)]
+    for fineness in cells:
+        model = with_cells(fineness)
+        say(f"sample count: {len(model.grid)} samples")
+        found = np.array([grid_errors(model, place) for place in places]).mean(0)
+        names = [f"{way}{what}" for way in ("middle", "prefiltered", "linear") for what in ("", "_frame")]
+        rows.append({"cells": fineness, "samples": len(model.grid), **dict(zip(names, found.tolist(), strict=True))})
+    return rows
+
+
+def grid_errors(model: PsfModel, place: tuple[float, ...]) -> list[float]:
+    """Similarity near and in the frame of three stand-ins for a PSF, see `sample_count`."""
+    psf = model.dense(place)
+    where = torch.tensor(place, dtype=torch.float64)
+    centres = model.grid.centres()
+    pairs = [(model.dense(centres[int(k)].tolist()), float(share)) for k, share in model.grid.neighbours(where)]
+    number = int(model.grid.index(where))
+    stand_ins = [
+        model.dense(centres[number].tolist()),
+        model.prefiltered(*model.grid.box(number)),
+        mean_picture(*zip(*pairs, strict=True)),
+    ]
+    found = [score(psf, centred(picture, neighbourhood(psf))) for picture in stand_ins]
+    return [value for each in found for value in (each.ssim, each.ssim_frame)]

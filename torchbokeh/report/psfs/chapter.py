@@ -4,24 +4,26 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.report.experiment import Experiment, Figures, draw_figures, find_rows, sections
 from torchbokeh.report.machine import machine
 from torchbokeh.report.psfs import plots as drawn
 from torchbokeh.report.psfs import tables
-from torchbokeh.report.psfs.analysis import Array, PsfSettings, equal_sparsity, large, needed, random_psfs, sizes, steps
-from torchbokeh.report.psfs.splats import far_field, many, random_samples, rotation, sample_count
-from torchbokeh.report.rows import Row, Say
+from torchbokeh.report.psfs.analysis import (
+    Array,
+    PsfSettings,
+    equal_sparsity,
+    large,
+    needed,
+    random_psfs,
+    sample_count,
+    sizes,
+    steps,
+)
+from torchbokeh.report.rows import Say
 
 
 def _psfs(settings: PsfSettings) -> Sequence[Array]:
     return random_psfs(settings.psfs, settings.support)
-
-
-def _sum(settings: PsfSettings, say: Say) -> list[Row]:
-    say(f"rotation: the sum of {settings.splats} splats")
-    chosen = random_samples(settings.turned, settings.reach)
-    return [many(PsfBank.load("combined"), chosen, settings.splats, settings.reach)]
 
 
 EXPERIMENTS = [
@@ -31,9 +33,6 @@ EXPERIMENTS = [
     Experiment("samples", lambda s, say: sample_count(s.coordinates, s.cells, say), tables.samples, drawn.samples),
     Experiment("ablation", lambda s, say: steps(_psfs(s)[: s.ablated], say), tables.ablation),
     Experiment("large", large, tables.large),
-    Experiment("far", lambda s, say: far_field(s.far, say), tables.far),
-    Experiment("rotation", lambda s, say: rotation(s.turned, s.angles, s.reach, say), tables.rotation, drawn.rotation),
-    Experiment("sum", _sum, tables.total),
 ]
 
 

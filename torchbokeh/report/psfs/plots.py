@@ -2,13 +2,11 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from torchbokeh.report.experiment import Figures
-from torchbokeh.report.figures import legend, one_panel, per_cent, plain_errors
+from torchbokeh.report.figures import legend, one_panel, per_cent
 from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY, THICK
 from torchbokeh.report.rows import Row, distinct, mean, of
 
@@ -101,22 +99,6 @@ def samples(rows: list[Row]) -> Figures:
     axes.grid(alpha=0.25)
     axes.legend(frameon=False, fontsize=9)
     return {"psfs_samples.png": figure}
-
-
-def rotation(rows: list[Row]) -> Figures:
-    """A line for each sample, in the colour of its radius."""
-    figure, axes = one_panel(6.5, 3.8)
-    radii = [row["radius"] for row in rows]
-    colours = ScalarMappable(LogNorm(min(radii), max(radii)), "viridis_r")
-    for radius, length in dict.fromkeys((row["radius"], row["length"]) for row in rows):
-        chosen = of(rows, radius=radius, length=length)
-        axes.plot([row["degrees"] for row in chosen], [row["l1"] for row in chosen], color=colours.to_rgba(radius))
-    axes.set(xlabel="angle in degrees", ylabel="relative L1 error", ylim=(0, None))
-    axes.set_xticks(range(0, 46, 15))
-    bar = figure.colorbar(colours, ax=axes, label="radius in px")
-    plain_errors(bar.ax.yaxis)
-    axes.grid(alpha=0.25)
-    return {"psfs_rotation.png": figure}
 
 
 def _mean_line(axes: Axes, name: str, value: float, form: str) -> None:

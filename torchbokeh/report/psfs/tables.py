@@ -7,7 +7,7 @@ import numpy as np
 
 from torchbokeh.report.markdown import row_table, section, table
 from torchbokeh.report.psfs.analysis import METHODS, SHARES, SPARSITY, THICK
-from torchbokeh.report.rows import Row, distinct, mean, of
+from torchbokeh.report.rows import Row, mean, of
 
 
 def head(found: dict[str, Any]) -> str:
@@ -114,41 +114,4 @@ def large(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
         "Large PSFs",
         "The least sparsity at which the similarity is 0.99, and the similarity that all candidates have.",
         row_table(rows, header, cells),
-    )
-
-
-def far(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
-    """What is seen far away."""
-    return section(
-        "Far field",
-        "The largest magnitude beyond 1, 1.5, 2 and 4 half sides of a sample with 8 px around it, over its maximum, of "
-        f"up to {settings['far']} Laplacian samples of each installed bank.",
-        row_table(rows, "bank | beyond | mean | largest", "`{bank}` | {factor:g} x | {mean:.1e} | {largest:.1e}"),
-    )
-
-
-def rotation(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
-    """The error of turned samples, by angle."""
-    degrees = distinct(rows, "degrees")
-    chosen = [[row["l1"] for row in of(rows, degrees=angle)] for angle in degrees]
-    return section(
-        "Rotation",
-        "Relative L1 error of a sample of `combined` that is turned as it is splatted, against the dense PSF turned. "
-        "Turned points fall between pixels and are shared by four, which blurs by a part of a pixel.",
-        "![error by angle](psfs_rotation.png)",
-        table(
-            ["degrees", *(f"{angle:g}" for angle in degrees)],
-            [["mean", *(f"{np.mean(c):.3f}" for c in chosen)], ["largest", *(f"{max(c):.3f}" for c in chosen)]],
-        ),
-    )
-
-
-def total(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
-    """The error of a sum of splats: a paragraph of the same section."""
-    (row,) = rows
-    return (
-        f"The sum of {row['splats']} splats of random colours, places and rotations has an error of "
-        f"{row['all']:.3f}, a splat alone {row['one']:.3f} in the mean. If the errors of splats that meet in a "
-        f"pixel were independent, so that they add up like the root of their number, it would be "
-        f"{row['expected']:.3f}."
     )

@@ -32,12 +32,9 @@ def baselines() -> dict[str, Method]:
 
 def absent() -> list[str]:
     """A line for every baseline whose package is not installed."""
-    lines = []
     if find_spec("numba") is None:
-        lines.append("dense scatter and gather filter: numba is not installed (`pip install torchbokeh[cpu]`)")
-    if not _blurgenerator_is_there():
-        lines.append("blurgenerator: not installed (`pip install blurgenerator`)")
-    return lines
+        return ["dense scatter and gather filter: numba is not installed (`pip install torchbokeh[cpu]`)"]
+    return []
 
 
 def _scatters() -> list[Method]:
@@ -109,8 +106,6 @@ def _fixed_kernels() -> list[Method]:
         about = f"kornia.filters.{name} with one disc, zeros beyond the border, divided by coverage"
         run = partial(_one_kernel, convolve=convolve)
         found.append(Method(f"kornia {name}", "fixed kernel", about, run, work, one_depth=True))
-    if _blurgenerator_is_there():
-        found.append(_blurgenerator_method())
     return found
 
 
@@ -119,26 +114,3 @@ def _one_kernel(image: Tensor, coc: Tensor, convolve: Callable[..., Tensor]) -> 
     kernel = torch.from_numpy(disc(coc.flatten()[0].abs().item())).to(image)[None]
     blurred = convolve(torch.cat([image, torch.ones_like(coc)], 1), kernel, border_type="constant")
     return blurred[:, :3] / blurred[:, 3:]
-
-
-def _blurgenerator_is_there() -> bool:
-    return find_spec("blurgenerator") is not None and find_spec("cv2") is not None
-
-
-def _blurgenerator_method() -> Method:
-    def work(coc: Tensor) -> float:
-        return 5e-9 * coc.numel() * (20 + 2 * coc.abs().max().item())
-
-    about = "blurgenerator.lens_blur: five complex Gaussians for one disc; 8 bits, as many threads as processors"
-    # Its five Gaussians are normalised to about a hundredth.
-    return Method("blurgenerator", "fixed kernel", about, _blurgenerator, work, normalised=False, one_depth=True)
-
-
-def _blurgenerator(image: Tensor, coc: Tensor) -> Tensor:
-    """The package takes pictures as a screen shows them, from 0 to 255, and undoes the exponent that it is told."""
-    from blurgenerator import lens_blur
-
-    shown = (image[0].permute(1, 2, 0) ** (1 / 2.2) * 255).numpy()
-    radius = max(coc.flatten()[0].abs().item(), 0.5)
-    blurred = lens_blur(shown, radius=radius, components=5, exposure_gamma=2.2)
-    return (torch.from_numpy(blurred).float().permute(2, 0, 1)[None] / 255) ** 2.2

@@ -18,7 +18,6 @@ from torchbokeh.report.rows import Row, Say
 from torchbokeh.report.scenes import photo
 from torchbokeh.report.settings import Settings
 from torchbokeh.report.speed.methods import own_methods, own_name
-from torchbokeh.report.speed.roofline import least_seconds, measured_rates
 
 Recorder = Callable[[], AbstractContextManager[dict[str, float]]]
 
@@ -30,13 +29,11 @@ def stages(settings: Settings, say: Say) -> list[Row]:
     """Seconds of every stage of a splat of ``photo``, for every quality and radius.
 
     Returns:
-        Rows with ``quality``, ``radius``, ``stage``, ``seconds`` (median), ``share`` of the whole, and
-        ``least_seconds``, a lower bound by what has to be read, written and drawn (see `roofline`); None where none is
-        known. Nothing without numba, whose kernels record their stages.
+        Rows with ``quality``, ``radius``, ``stage``, ``seconds`` (median) and ``share`` of the whole. Nothing without
+        numba, whose kernels record their stages.
     """
     if not numba_is_there():
         return []
-    rates = measured_rates()
     rows: list[Row] = []
     for radius in settings.photo_radii:
         say(f"share of each stage: radius {radius:g} px")
@@ -44,10 +41,7 @@ def stages(settings: Settings, say: Say) -> list[Row]:
         for quality in QUALITY_NAMES:
             run = own_methods()[own_name(quality)].run
             found = shares(partial(run, seen.image, seen.coc), recorded, settings.repeat)
-            least = least_seconds(seen.image, seen.coc, quality, rates)
-            rows += [
-                {"quality": quality, "radius": radius, **row, "least_seconds": least.get(row["stage"])} for row in found
-            ]
+            rows += [{"quality": quality, "radius": radius, **row} for row in found]
     return rows
 
 
@@ -75,8 +69,8 @@ def shares(work: Callable[[], Tensor], recorded: Recorder, repeat: int) -> list[
 
 
 def _section(rows: list[Row], settings: Row, plots: Sequence[str]) -> str:
-    header = "quality | radius | stage | seconds | share | least seconds"
-    cells = "{quality} | {radius:g} | {stage} | {seconds:t} | {share:.0%} | {least_seconds:t}"
+    header = "quality | radius | stage | seconds | share"
+    cells = "{quality} | {radius:g} | {stage} | {seconds:t} | {share:.0%}"
     return section("Share of each stage", row_table(rows, header, cells))
 
 

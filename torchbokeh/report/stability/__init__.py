@@ -1,1 +1,1 @@
-"""Numerical stability: cases, bounds and oracles."""
+"""Numerical stability: cases and their bounds."""

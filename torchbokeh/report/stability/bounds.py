@@ -1,27 +1,25 @@
 """What rounding and approximation may do: bounds that every stiff case is held to.
 
-Those of rounding are derived from the arithmetic. `TIES`, `GRAZING`, `DENSITY`, `BESIDE`, `BORDER`, `far_leak` and the
-errors of qualities are stated, not derived: they say what they were taken from, and rows held to one are marked.
+Those of rounding are derived from the arithmetic. `TIES`, `GRAZING`, `far_leak` and the errors of qualities
+are stated, not derived: they say what they were taken from, and rows held to one are marked.
 
 ``u`` is the unit round-off of the dtype in which pictures are held while they are worked on, ``u64`` that of double.
 Weights, ends of rows and running sums are double in float32 as well, so errors of the sums count with ``u64``.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import STEPS
-from torchbokeh.ops.spans import MIN_RADIUS
-from torchbokeh.report.internals import BRIGHT, COARSE, FOREGROUND, QUALITIES, STEPS_OF_VIEWS
+from torchbokeh.ops.dense import dense_spans
+from torchbokeh.ops.merge import EVEN, STEPS
+from torchbokeh.psfs.aperture import Disc
+from torchbokeh.report.internals import BRIGHT, FOREGROUND, QUALITIES, STEPS_OF_VIEWS
 from torchbokeh.report.stability.cases import Case
-from torchbokeh.report.stability.renderer import Renderer
-from torchbokeh.report.stability.renderers import coverage
+from torchbokeh.report.stability.renderers import Renderer
 
 U64 = torch.finfo(torch.float64).eps / 2
 
@@ -35,6 +33,34 @@ ARC = 1e-11
 DENORMAL = 8
 """Steps of the smallest number that a result may be off where it is not a normal number any more: one for each of the
 `STORED` roundings, divided by a coverage of at least 1/2."""
+
+OPERATIONS = 64
+"""Roundings that the weight of a surface goes through in a composition: hats of bins (2), their coverage (2), filling
+(3), density and share (4), votes (4) and their sums over 3 x 3 sub-apertures (18), the quotient and the mean (3): 36;
+filled colours come from as many as log2 of the size levels of two operations each."""
+
+GREEN = 1.3
+"""Largest value of the lattice's Green's function over buffers of up to 2000 px: (log r + 1.616) / (2 pi)."""
+
+POINTS = 8.0
+"""Largest sum of magnitudes of the points of a sparse PSF: the Laplacian of a single pixel, 4 + 4 * 1."""
+
+GRAZING = 1 / 20
+"""Of the contrast of a picture, where sub-samples cast rays through the depth of a view. Stated, not derived.
+
+A surface ends half a pixel from the middle of its last one. A ray that just grazes that end may meet it or not, and
+then sees something else: one of the four rays of a pixel and itself, in a quarter of the views.
+"""
+
+STEP = EVEN / STEPS
+"""The largest step from one rounded radius to the next, in proportion to the radius."""
+
+TIES = 8 * STEP
+"""Of the contrast of a picture, where radii are averaged and then rounded to steps. Stated, not derived.
+
+A radius that lies on the border of a step may be rounded to the other side in another precision. That moves ``4 STEP``
+of the light of its pixel; of what another pixel receives, several such pixels together could do as much again.
+"""
 
 
 @dataclass(frozen=True)
@@ -78,55 +104,44 @@ PRECISIONS = (
 )
 
 
-def bound(renderer: Renderer, case: Case, want: Tensor, image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
-    """Largest error of each pixel, of the shape of ``want``.
+def rounding(renderer: Renderer, case: Case, want: Tensor, image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
+    """Largest error of each pixel against the renderer itself in double, of the shape of ``want``.
 
     Args:
         renderer: of the picture.
         case: what it was asked.
-        want: the result of the oracle for the rounded inputs.
+        want: its result in double, for the rounded inputs.
         image: the inputs, rounded to the precision, in double.
         coc: likewise.
         precision: in which they were given.
     """
-    views = partial(_views, motion=renderer.motion(case))
-    bounds: dict[str, Callable[[Tensor, Tensor, Precision], Tensor]]
-    bounds = {"splat": _splat, "merged": _splat, "composed": _composed, "layers": _composed, "views": views}
-    of = (bounds | {"colours": _colours, "rays": views}).get(renderer.kind, _bank)
     # Whether the radii are the least or the largest: one has the largest weights, the other the least coverage.
-    least, largest = renderer.widths(coc)
-    absolute = of(image, largest, precision)
-    if least is not largest:
-        absolute = torch.maximum(absolute, of(image, least, precision))
+    absolute = torch.stack([_absolute(renderer, case, image, radii, precision) for radii in renderer.widths(coc)])
     rounded = (STORED * precision.work + precision.store) * want.abs()
+    contrast = image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True)
     if renderer.kind == "rays":
-        rounded = rounded + GRAZING * (image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True))
+        rounded = rounded + GRAZING * contrast
     if renderer.layered:
         # The layers of a case are made in its precision: alpha, colour times alpha, and what is behind are rounded.
         rounded = rounded + 3 * precision.store * image.abs().amax((1, 2, 3), keepdim=True)
-    return rounded + absolute + DENORMAL * precision.least
+    if renderer.merges:
+        rounded = rounded + TIES * contrast
+    return (rounded + absolute.amax(0) + DENORMAL * precision.least).expand_as(want)
 
 
-GRAZING = 1 / 20
-"""Of the contrast of a picture, where sub-samples cast rays through the depth of a view. Stated, not derived.
+def _absolute(renderer: Renderer, case: Case, image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
+    """What does not shrink with the result, by the kind of a renderer.
 
-A surface ends half a pixel from the middle of its last one. A ray that just grazes that end may meet it or not, and
-then sees something else: one of the four rays of a pixel and itself, in a quarter of the views.
-"""
-
-TIES = 1 / STEPS
-"""Of the contrast of a picture, where radii are averaged and then rounded to steps. Stated, not derived.
-
-A radius r that lies on the border of a step may be rounded to the other side in another precision. That moves
-``4 / (64 r)`` of the light of its pixel, which is up to ``1 / (pi r**2)`` of what another pixel receives: 1/50 at 1 px.
-Several such pixels together, or smaller radii, could do more.
-"""
-
-
-def ties(renderer: Renderer, image: Tensor) -> Tensor:
-    """What steps of radii may add to the error against the renderer itself in double, ``(B, 1, 1, 1)``."""
-    contrast = image.amax((1, 2, 3), True) - image.amin((1, 2, 3), True)
-    return TIES * contrast if renderer.quality != "exact" else 0 * contrast
+    A composition is a mean of colours whose weights are off by `OPERATIONS` roundings. What hides something leaves
+    ``1 - stopped`` of it, whose error is absolute: so the error is that of the brightest light behind, and not of the
+    result. Votes are counted from a density of 1/4 on.
+    """
+    splat = _splat(image, coc, precision)
+    if renderer.kind in ("splat", "merged"):
+        return splat
+    composed = 4 * OPERATIONS * precision.work + _places(renderer, case, coc, precision)
+    absolute = composed * image.abs().amax((1, 2, 3), keepdim=True) + splat.amax()
+    return absolute + _laplacian(image, coc, precision) if renderer.kind == "bank" else absolute
 
 
 def _splat(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
@@ -143,38 +158,31 @@ def _splat(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
     summed = 8 * height * width * U64 * weight * brightest
     arc = 0.0 if precision.dtype == torch.float64 else ARC * brightest
     covered = coverage(coc)
-    return (summed + arc * torch.maximum(covered, torch.ones_like(covered))) / covered.clamp_min(TINY)
+    return (summed + arc * covered.clamp_min(1)) / covered.clamp_min(TINY)
 
 
-OPERATIONS = 64
-"""Roundings that the weight of a surface goes through in a composition: hats of bins (2), their coverage (2), filling
-(3), density and share (4), votes (4) and their sums over 3 x 3 sub-apertures (18), the quotient and the mean (3): 36;
-filled colours come from as many as log2 of the size levels of two operations each."""
+def coverage(coc: Tensor) -> Tensor:
+    """What all discs together cover of each pixel, ``(B, 1, H, W)`` float64."""
+    return dense_spans(torch.ones_like(coc), coc, Disc().profile())
 
 
-def _composed(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
-    """Absolute error of a composition: a mean of colours whose weights are off by `OPERATIONS` roundings.
+def _places(renderer: Renderer, case: Case, coc: Tensor, precision: Precision) -> float:
+    """Error of what is looked up at places in px, as a share of the brightest light.
 
-    What hides something leaves ``1 - stopped`` of it, whose error is absolute: so the error is that of the brightest
-    light behind, and not of the result. Votes are counted from a density of 1/4 on (`CERTAIN`).
+    A place is held to ``u`` times the size of the picture and of what moves it. That of a view is the fourth iterate of
+    one that comes to lie on a pixel (`torchbokeh.views.layers.STEPS`): each step multiplies what it is off by the slope
+    of the CoC and of the motion, of which a view sees half at most. Beyond a pixel, anything may be looked up.
     """
-    brightest = image.abs().amax((1, 2, 3), keepdim=True)
-    return 4 * OPERATIONS * precision.work * brightest + _splat(image, coc, precision).amax()
-
-
-def _views(image: Tensor, coc: Tensor, precision: Precision, motion: Tensor | None = None) -> Tensor:
-    """Absolute error of the mean of views: that of a composition, and of places in px that are looked up.
-
-    A place is the fourth iterate of one that comes to lie on a pixel (`torchbokeh.views.layers.STEPS`). It is held to
-    ``u`` times the size of the picture and of what moves it, and each step multiplies what it is off by the slope of
-    the CoC and of the motion, of which a view sees half at most: beyond a pixel, anything may be looked up.
-    """
-    moving = coc if motion is None else coc.abs() + motion.abs().amax(1, keepdim=True) / 2
-    slope, size = _steepest(coc), max(*image.shape[2:], float(moving.abs().max()))
-    slope += 0.0 if motion is None else _steepest(motion) / 2
-    apart = 8 * precision.work * size * (1 + slope) ** STEPS_OF_VIEWS
-    brightest = image.abs().amax((1, 2, 3), keepdim=True)
-    return _composed(image, coc, precision) + 2 * min(apart, 1.0) * brightest
+    side = max(coc.shape[2:])
+    if renderer.kind == "colours":  # light is shared by two pixels each way
+        return 4 * 8 * precision.work * side
+    if renderer.kind not in ("views", "rays"):
+        return 0.0
+    motion = renderer.motion(case)
+    way = torch.zeros_like(coc) if motion is None else motion / 2
+    slope = _steepest(coc) + _steepest(way)
+    size = max(side, float((coc.abs() + way.abs().amax(1, keepdim=True)).max()))
+    return 2 * min(8 * precision.work * size * (1 + slope) ** STEPS_OF_VIEWS, 1.0)
 
 
 def _steepest(maps: Tensor) -> float:
@@ -182,23 +190,7 @@ def _steepest(maps: Tensor) -> float:
     return max((float(maps.diff(dim=d).abs().max()) for d in (2, 3) if maps.shape[d] > 1), default=0.0)
 
 
-def _colours(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
-    """Absolute error of a mean of compositions, each magnified: that of one, and of places in px that are looked up.
-
-    A place is held to ``u`` times the size of the picture, and light is shared by two pixels each way.
-    """
-    brightest = image.abs().amax((1, 2, 3), keepdim=True)
-    return _composed(image, coc, precision) + 4 * 8 * precision.work * max(image.shape[2:]) * brightest
-
-
-GREEN = 1.3
-"""Largest value of the lattice's Green's function over buffers of up to 2000 px: (log r + 1.616) / (2 pi)."""
-
-POINTS = 8.0
-"""Largest sum of magnitudes of the points of a sparse PSF: the Laplacian of a single pixel, 4 + 4 * 1."""
-
-
-def _bank(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
+def _laplacian(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
     """Absolute error of splats in the Laplacian domain: the rounding of their buffer, times the Green's function.
 
     The buffer holds `POINTS` times the light of all pixels that are no highlights, and is stored in the working
@@ -211,7 +203,7 @@ def _bank(image: Tensor, coc: Tensor, precision: Precision) -> Tensor:
     stored = 2 * precision.work * GREEN * POINTS * ordinary.sum((1, 2, 3), keepdim=True)
     # Numbers of the buffer that are not normal are off by a step each.
     least = torch.finfo(torch.float32).smallest_normal * torch.finfo(torch.float32).eps
-    return stored + 4 * GREEN * least * image[0, 0].numel() + _composed(image, coc, precision)
+    return stored + 4 * GREEN * least * image[0, 0].numel()
 
 
 def far_leak(case: Case) -> float:
@@ -219,51 +211,18 @@ def far_leak(case: Case) -> float:
     return min(1e-6 * case.peak, 1e-3 * max(case.even, 1.0))
 
 
-DENSITY = 0.08
-"""Relative L1 error of a composition of a picture of one block, and in proportion less with more of them across.
+def approximation(renderer: Renderer, coc: Tensor) -> float:
+    """Relative L1 error of a renderer that merges, against its exact quality.
 
-Stated, not derived, and loose: twice the largest that the cases showed, a picture of 2 x 2 px apart, when the two
-fastest qualities found the density of splats in blocks of 4 x 4 px. Only what is hidden is filled in blocks now.
-"""
-
-BESIDE = 0.3
-"""Of the light of the brightest pixel, where that lies within a block of the border: it is not spread over a picture of
-which a part is wrong. Stated, not derived, and loose as the one above."""
-
-BORDER = 1e-3
-"""Relative L1 error where banks are integrated on a torus. Stated, not derived: four times the largest that was seen.
-
-`torchbokeh.ops.integrate.poisson_fft` with ``compact=True`` takes the picture to vanish on the border of its buffer.
-The light of sparse points does so only about: what is left there comes back from all sides. The error has no
-Laplacian, so that it is largest at the border, where it is that of the images that meet there.
-"""
-
-
-def approximation(renderer: Renderer, image: Tensor, coc: Tensor) -> float:
-    """Relative L1 error of a renderer that approximates its definition.
-
-    Splats of a quality have the error that it promises, and radii that are rounded to 1/64 of a pixel or cell: a disc
-    of radius r differs from one of r + d by ``4 d / r`` of its light, and d is at most half a step. Over one another,
+    Splats of a quality have the error that it promises, and radii that are rounded: a disc of radius r differs from one
+    of r + d by ``4 d / r`` of its light, and d is at most half a step. Over one another,
     surfaces F and R with the share s of light that F stops are ``s F + (1 - s) R``, whose error is at most
     ``s dF + (1 - s) dR + ds |F - R|``: once more that of a splat for a surface that hides something.
     """
     quality = next(q for q in QUALITIES if q.name == renderer.quality)
-    border = 0.0 if renderer.bank is None else BORDER
-    if quality.merging is None:
-        return border
-    light = image.abs().sum(1, keepdim=True)
-    share = light / light.sum().clamp_min(1e-300)
-    steps = 4 * 0.5 / STEPS * float((share / coc.abs().clamp_min(MIN_RADIUS)).sum())
+    splat = quality.error + 2 * STEP
     hides = renderer.kind == "layers" or (renderer.kind != "merged" and float(coc.min()) < FOREGROUND[1])
-    if not hides:
-        return quality.error + steps + border
-    twice = 2 * (quality.error + steps) + border
-    if not quality.coarse:
-        return twice
-    blocks = math.ceil(min(image.shape[2:]) / COARSE)
-    beside = share.clone()
-    beside[..., COARSE:-COARSE, COARSE:-COARSE] = 0
-    return twice + DENSITY / blocks + BESIDE * float(beside.max())
+    return 2 * splat if hides else splat
 
 
 def lipschitz(contrast: float, radius: float, covered: float) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,12 +19,13 @@ class Case:
     """A picture to blur, in float64.
 
     Attributes:
-        group: ``"dynamic range"``, ``"radius"``, ``"motion"`` or ``"size"``.
+        group: ``"dynamic range"``, ``"radius"``, ``"motion"``, ``"size"`` or ``"highlight"``.
         name: of it.
         image: ``(B, C, H, W)``.
         coc: ``(B, 1, H, W)`` signed radius in px.
         motion: ``(B, 2, H, W)`` in px; ``None`` where renderers of motion take their own.
-        bright: places (y, x) of the highlights on an even background, whose leak is measured.
+        bright: place (y, x) of the highlight on an even background, whose leak is measured.
+        across: side in px of the square of such highlights that begins there.
         even: brightness of that background.
         promised: whether the picture is of the kind for which a quality promises its error: the radius varies little
             from pixel to pixel.
@@ -35,13 +36,15 @@ class Case:
     image: Tensor
     coc: Tensor
     motion: Tensor | None = None
-    bright: tuple[tuple[int, int], ...] = ()
+    bright: tuple[int, int] | None = None
+    across: int = 1
     even: float = MEAN
     promised: bool = True
-    peak: float = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "peak", float(self.image.abs().max()) if self.image.numel() else 0.0)
+    @property
+    def peak(self) -> float:
+        """The largest magnitude of the picture; 0 of an empty one."""
+        return float(self.image.abs().max()) if self.image.numel() else 0.0
 
 
 def texture(height: int, width: int, seed: int = 0, channels: int = 3) -> Tensor:
@@ -81,7 +84,7 @@ def dynamic_range(side: int) -> Iterator[Case]:
             image = torch.full((1, 3, side, side), ground, dtype=torch.float64)
             image[..., at[0], at[1]] = value
             beside = "grey" if ground else "black"
-            yield Case(group, f"{value:.0e} beside {beside}", image, wide, bright=(at,), even=ground)
+            yield Case(group, f"{value:.0e} beside {beside}", image, wide, bright=at, even=ground)
         image = texture(side, side)
         image[..., at[0], at[1]] = value
         yield Case(group, f"{value:.0e} beside texture", image, wide)
@@ -90,7 +93,7 @@ def dynamic_range(side: int) -> Iterator[Case]:
     yield Case(group, "a field of 1e4", image, wide)
     image = torch.full((1, 3, side, side), MEAN, dtype=torch.float64)
     image[..., at[0], at[1]] = HALF_MAX
-    yield Case(group, "65504 beside grey", image, wide, bright=(at,))
+    yield Case(group, "65504 beside grey", image, wide, bright=at)
     yield Case(group, "all 65504", torch.full((1, 3, side, side), HALF_MAX, dtype=torch.float64), wide)
     yield Case(group, "denormal (1e-40)", texture(side, side) * 1e-40, wide)
     yield Case(group, "all black", torch.zeros(1, 3, side, side, dtype=torch.float64), wide)
@@ -148,15 +151,31 @@ def sizes(side: int) -> Iterator[Case]:
     yield Case(group, "dark beside bright in a batch", pair, coc)
 
 
+def highlights(side: int, edge: int) -> Iterator[Case]:
+    """A pixel of 1e6 over an even ground of 1, at two radii; and a square of such pixels, ``edge`` px wide."""
+    (one,) = [case for case in dynamic_range(side) if case.name == "1e+06 beside grey"]
+    for radius in (side / 64, side / 24):
+        name = f"1e6 over 1, radius {radius:.1f} px"
+        yield replace(one, group="highlight", name=name, coc=slope(side, side, 0.95 * radius, radius))
+    side = edge + 140
+    image = torch.ones(1, 3, side, side, dtype=torch.float64)
+    image[..., :edge, :edge] = 1e6
+    coc = slope(side, side, 4.5, 5.0)
+    yield Case("highlight", f"{edge} x {edge} of 1e6 over 1", image, coc, bright=(0, 0), across=edge)
+
+
 def beyond(case: Case, reach: float, *, mirrored: bool) -> Tensor:
-    """Pixels ``(H, W)`` that are farther than ``reach`` px from every highlight of a case (and its mirror image)."""
-    height, width = case.image.shape[-2:]
-    y, x = torch.arange(height)[:, None], torch.arange(width)
-    far = torch.ones(height, width, dtype=torch.bool)
-    places = case.bright + tuple((v, width - 1 - u) for v, u in case.bright if mirrored)
-    for v, u in places:
-        far &= torch.hypot(y - v + 0.0 * x, x - u + 0.0 * y) > reach
-    return far
+    """Pixels ``(H, W)`` that are farther than ``reach`` px from the highlights of a case (and their mirror image)."""
+    assert case.bright is not None
+    away = [_away(n, start, case.across) for n, start in zip(case.image.shape[2:], case.bright, strict=True)]
+    far = torch.hypot(away[0][:, None], away[1]) > reach
+    return far & far.flip(1) if mirrored else far
+
+
+def _away(size: int, start: int, across: int) -> Tensor:
+    """How far each pixel of a line lies from those of a stretch of it."""
+    at = torch.arange(size, dtype=torch.float64)
+    return torch.maximum(start - at, at - (start + across - 1)).clamp_min(0)
 
 
 def reach_of(coc: Tensor, motion: Tensor | None, ahead: float = 0.5) -> float:

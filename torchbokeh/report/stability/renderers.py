@@ -1,13 +1,9 @@
-"""The renderers that stiff cases are run through, each with an oracle in double.
-
-Where a renderer does what its definition says but for rounding, the oracle is that definition, by plain sums
-(`torchbokeh.report.stability.oracles`). Where it approximates it, by merging or by the border of a buffer, there are
-two: itself in double, for rounding, and the definition, for the approximation.
-"""
+"""The renderers that stiff cases are run through: a new one is a line in `renderers`."""
 
 import math
-from collections.abc import Iterator
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -15,32 +11,29 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import torchbokeh
-from torchbokeh import AccumulationBuffer, ChromaticAccumulation, KernelSplatting, LensBlur
-from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.dense import dense_spans
+from torchbokeh import AccumulationBuffer, ChromaticAccumulation, KernelSplatting, LensBlur, PsfBank
 from torchbokeh.ops.dispatch import compute_dtype
-from torchbokeh.psfs.aperture import Disc
-from torchbokeh.report.internals import QUALITIES, pixel_positions
-from torchbokeh.report.stability.oracles import gathered, splatted, viewed
-from torchbokeh.report.stability.renderer import (
-    VIEWS,
-    Renderer,
-    bank_of,
-    blur_renderer,
-    call_with,
-    layered,
-    layers_of,
-    moving,
-    moving_layers,
-    picture,
-    splatting_renderer,
-)
+from torchbokeh.psfs.model import Labels
+from torchbokeh.report.internals import QUALITY_NAMES, pixel_positions
+from torchbokeh.report.stability.cases import Case, reach_of
 
-CUT_TO = 6.0
-"""``max_coc`` of the renderer that has one, in px."""
+Call = Callable[..., Tensor]
 
-MARGIN = 3
-"""Of the renderer that has one, in px."""
+Inputs = Callable[[Tensor, Tensor, Any], tuple[Any, dict[str, Any]]]
+"""What a renderer is given for ``(image, coc, motion)``: what comes first, and all else by name."""
+
+WAY = (5.0, -3.0)
+"""Motion in px where a renderer needs one and a case has none."""
+
+VIEWS = 16
+"""Of the accumulation buffer."""
+
+WIDEST = 100.0
+"""Radius in px up to which banks other than that of motion are asked: what they scale their PSFs to needs a buffer as
+large, and that of 1e4 px is refused."""
+
+CUT_TO, MARGIN = 6.0, 3
+"""``max_coc`` and ``margin`` of the renderer that has both, in px."""
 
 TEXELS = 1.5 * math.sqrt(2) * 2 * math.sqrt(math.pi)
 """How far a level of detail of 1 spreads light, as a share of the radius: a texel covers up to the area of the blur, or
@@ -50,75 +43,131 @@ SPREAD = 3.0
 """How far in px `dispersing` moves light, in radius and in place, at most."""
 
 
+@dataclass(frozen=True)
+class Renderer:
+    """One way to render a case.
+
+    Attributes:
+        name: for tables.
+        kind: which bound holds for it, see `torchbokeh.report.stability.bounds`.
+        make: of a quality and the width of the picture in px, what renders it.
+        inputs: what that is given.
+        quality: name of the operating point; ``"exact"`` where there is no choice.
+        bank: of the PSFs, where they are not flat discs.
+        moves: whether it looks at motion.
+        ahead: how far it goes along a motion, as a share of the length of that: half of it about the middle.
+        texels: how much farther than its radius a PSF reaches by coarse texels, as a share of it.
+        widths: least and largest radius, signed, of what has a CoC.
+    """
+
+    name: str
+    kind: str
+    make: Callable[[str, int], Call]
+    inputs: Inputs
+    quality: str = "exact"
+    bank: str | None = None
+    moves: bool = False
+    ahead: float = 0.5
+    texels: float = 0.0
+    widths: Callable[[Tensor], tuple[Tensor, ...]] = lambda coc: (coc,)
+
+    @property
+    def layered(self) -> bool:
+        """Whether it takes the two layers of `layers_of`."""
+        return self.kind in ("layers", "views", "rays")
+
+    @property
+    def merges(self) -> bool:
+        """Whether it approximates what its exact quality does."""
+        return self.quality != "exact"
+
+    def run(self, image: Tensor, coc: Tensor, motion: Tensor | None, quality: str | None = None) -> Tensor:
+        """Render ``(image, coc, motion)`` in their dtype, at its own quality or at another one."""
+        first, others = self.inputs(image, coc, motion)
+        return self.make(quality or self.quality, image.shape[3])(first, **others)
+
+    def takes(self, case: Case) -> bool:
+        """Whether a case says anything about this renderer, and is among what it is for."""
+        empty, channels = case.image.numel() == 0, case.image.shape[1]
+        if (case.group == "motion" and not self.moves) or (empty and self.kind in ("samples", "views", "rays")):
+            return False
+        coloured = self.layered or self.kind in ("samples", "colours") or self.bank not in (None, "combined")
+        if channels != 3 and coloured:
+            return False
+        return empty or self.bank in (None, "combined") or float(case.coc.abs().max()) <= WIDEST
+
+    def gain(self) -> float:
+        """The largest factor of the values: 1 of a mean, more where PSFs are tinted."""
+        return 1.0 if self.bank is None else max(1.0, float(bank_of(self.bank).gains().max()) - 0.01)
+
+    def reach(self, case: Case) -> float:
+        """How far in px the PSFs of a case reach."""
+        if self.bank in (None, "combined"):
+            return reach_of((1 + self.texels) * self.widths(case.coc)[-1], self.motion(case), self.ahead)
+        bank = bank_of(self.bank)
+        place = bank.model.place(Labels(case.coc))
+        scale = 1.0 if place.scale is None else float(place.scale.max())
+        number = bank.model.grid.index(place.coordinates.movedim(1, -1))
+        return math.sqrt(2) * scale * float(bank.reach()[number].max()) + 3
+
+    def motion(self, case: Case) -> Tensor | None:
+        """The motion of a case, or one in its place, where the renderer needs one."""
+        if not self.moves or case.motion is not None:
+            return case.motion if self.moves else None
+        way = torch.tensor(WAY, dtype=torch.float64).view(1, 2, 1, 1)
+        return way.expand(len(case.image), 2, *case.image.shape[2:]).contiguous()
+
+
 def renderers() -> Iterator[Renderer]:
-    """All of them."""
-    for quality in QUALITIES:
-        kind = "splat" if quality.merging is None else "merged"
-        name = f"KernelSplatting, {quality.name}"
-        yield splatting_renderer(name, kind, KernelSplatting(quality=quality.name), dense)
-    for quality in QUALITIES:
-        blur = LensBlur(quality=quality.name)
-        yield blur_renderer(f"LensBlur image, {quality.name}", "composed", blur, picture)
-        yield blur_renderer(f"LensBlur layers, {quality.name}", "layers", blur, layered)
-        yield blur_renderer(f"LensBlur motion, {quality.name}", "bank", blur, moving, moves=True, bank="combined")
-    for name in ("stylized", "physical-lens"):
-        bank = bank_of(name)
-        splatting, slow = KernelSplatting(quality="exact", bank=bank), lambda i, c, _, bank=bank: splatted(bank, i, c)
-        yield splatting_renderer(f"KernelSplatting, bank {name}", "bank", splatting, slow, bank=name)
-    run = partial(call_with, AccumulationBuffer(views=VIEWS), layered)
-    yield Renderer("AccumulationBuffer layers", "views", run, lambda i, c, _: viewed(*layers_of(i, c), VIEWS))
-    yield from options()
-    yield Renderer("reconstruct", "samples", _samples, _samples, moves=True, bank="combined", sums=gathered)
-
-
-def options() -> Iterator[Renderer]:
-    """Renderers with the options that a user may set, one of each."""
-    for quality in ("exact", "balanced"):
+    """All of them, and those with the options that a user may set, one of each."""
+    moving: dict[str, Any] = {"moves": True, "bank": "combined"}
+    for q in QUALITY_NAMES:
+        kind = "splat" if q == "exact" else "merged"
+        yield Renderer(f"KernelSplatting, {q}", kind, _of(KernelSplatting), _picture, q)
+        yield Renderer(f"LensBlur image, {q}", "composed", _of(LensBlur), _picture, q)
+        yield Renderer(f"LensBlur layers, {q}", "layers", _of(LensBlur), _layers, q)
+        yield Renderer(f"LensBlur motion, {q}", "bank", _of(LensBlur), _moving, q, **moving)
+    for q in ("exact", "balanced"):
         for spectrum in ("rgb", "continuous"):
-            run, plan = partial(_coloured, spectrum, quality), partial(_coloured_plan, spectrum, quality)
-            name = f"LensBlur dispersion {spectrum}, {quality}"
-            yield Renderer(name, "colours", run, run, plan, widths=dispersed, quality=quality)
-        bank: dict[str, Any] = {"moves": True, "bank": "combined"}
-        blur = LensBlur(quality=quality)
-        yield blur_renderer(f"LensBlur approaching, {quality}", "bank", blur, _approaching, widths=_doubled, **bank)
-        blur = LensBlur(quality=quality, shutter="start")
-        yield blur_renderer(f"LensBlur curved motion, {quality}", "bank", blur, _curved, ahead=1.25, **bank)
-    yield blur_renderer("LensBlur 6-gon, exact", "composed", LensBlur(aperture="6-gon"), picture)
-    yield blur_renderer("LensBlur background, exact", "composed", LensBlur(), _background)
-    blur = LensBlur(margin=MARGIN, max_coc=CUT_TO, quality="balanced")
-    yield blur_renderer("LensBlur margin and max_coc, balanced", "composed", blur, _margin, widths=_cut)
-    run = partial(call_with, AccumulationBuffer(views=VIEWS, level_of_detail=1.0, reuse=1), layered)
-    yield Renderer("AccumulationBuffer layers, coarser and shared", "views", run, run, texels=TEXELS)
-    run = partial(call_with, AccumulationBuffer(views=VIEWS, subsamples=4), layered)
-    yield Renderer("AccumulationBuffer layers, sub-samples", "rays", run, run)
-    run = partial(call_with, AccumulationBuffer(views=VIEWS), moving_layers)
-    yield Renderer("AccumulationBuffer layers, in motion", "views", run, _moving_viewed, moves=True)
+            name = f"LensBlur dispersion {spectrum}, {q}"
+            yield Renderer(name, "colours", _of(LensBlur, spectrum), _picture, q, widths=_dispersed)
+        yield Renderer(f"LensBlur approaching, {q}", "bank", _of(LensBlur), _near, q, widths=_doubled, **moving)
+        curved = _of(LensBlur, shutter="start")
+        yield Renderer(f"LensBlur curved motion, {q}", "bank", curved, _curved, q, ahead=1.25, **moving)
+    for bank in ("stylized", "physical-lens"):
+        splatting = _of(KernelSplatting, bank=bank_of(bank))
+        yield Renderer(f"KernelSplatting, bank {bank}", "bank", splatting, _picture, bank=bank)
+    yield Renderer("LensBlur 6-gon, exact", "composed", _of(LensBlur, aperture="6-gon"), _picture)
+    yield Renderer("LensBlur background, exact", "composed", _of(LensBlur), _background)
+    cut = _of(LensBlur, margin=MARGIN, max_coc=CUT_TO)
+    yield Renderer("LensBlur margin and max_coc, balanced", "composed", cut, _margin, "balanced", widths=_cut)
+    views, coarser = _of(AccumulationBuffer), _of(AccumulationBuffer, level_of_detail=1.0, reuse=1)
+    yield Renderer("AccumulationBuffer layers", "views", views, _layers)
+    yield Renderer("AccumulationBuffer layers, coarser and shared", "views", coarser, _layers, texels=TEXELS)
+    yield Renderer("AccumulationBuffer layers, sub-samples", "rays", _of(AccumulationBuffer, subsamples=4), _layers)
+    yield Renderer("AccumulationBuffer layers, in motion", "views", views, _moving_layers, moves=True)
     for spectrum in ("rgb", "continuous"):
-        run = partial(_chromatic_views, spectrum)
-        yield Renderer(f"ChromaticAccumulation layers, {spectrum}", "views", run, run, widths=dispersed)
+        views = _of(ChromaticAccumulation, spectrum)
+        yield Renderer(f"ChromaticAccumulation layers, {spectrum}", "views", views, _layers, widths=_dispersed)
+    yield Renderer("reconstruct", "samples", lambda quality, width: torchbokeh.reconstruct, _samples, **moving)
 
 
-def dense(image: Tensor, coc: Tensor, motion: Tensor | None = None) -> Tensor:
-    """Every pixel's disc, row by row, divided by the coverage: float64."""
-    out = dense_spans(torch.cat([image, torch.ones_like(coc)], 1), coc, Disc().profile())
-    return out[:, :-1] / out[:, -1:].clamp_min(TINY)
+def _of(kind: type[Any], spectrum: str | None = None, **options: Any) -> Callable[[str, int], Call]:
+    """What makes a renderer of a quality, and with dispersion a lens for the width of the picture."""
+
+    def made(quality: str, width: int) -> Call:
+        lens = {} if spectrum is None else {"lens": dispersing(width, spectrum)}
+        views = kind in (AccumulationBuffer, ChromaticAccumulation)
+        made: Call = kind(**lens, **options, **({"views": VIEWS} if views else {"quality": quality}))
+        return made
+
+    return made
 
 
-def coverage(coc: Tensor) -> Tensor:
-    """What all discs together cover of each pixel, ``(B, 1, H, W)`` float64."""
-    return dense_spans(torch.ones_like(coc), coc, Disc().profile())
-
-
-def _samples(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    """Samples in the middle of their pixels, of the lens and of the exposure: a plain picture."""
-    assert motion is not None
-    # Half precision cannot tell the columns of a wide picture apart.
-    position = pixel_positions(image.to(compute_dtype(image))).expand(len(image), 2, *image.shape[2:])
-    zero = torch.zeros_like(position)
-    present = torch.ones_like(coc, dtype=torch.bool)
-    return torchbokeh.reconstruct(
-        torchbokeh.Samples(*(t[:, None] for t in (image, position, zero, zero[:, :1], coc, motion, present)))
-    )
+@lru_cache
+def bank_of(name: str) -> PsfBank:
+    """A bank that comes with the package."""
+    return PsfBank.load(name)
 
 
 @lru_cache
@@ -128,58 +177,75 @@ def dispersing(width: int, spectrum: str) -> torchbokeh.ThinLens:
     return torchbokeh.ThinLens(0.05, 1.0, 2.0, sensor_width=0.003 * width, dispersion=dispersion)
 
 
-def dispersed(coc: Tensor) -> tuple[Tensor, Tensor]:
-    """Radii that differ from those of a CoC by `SPREAD`."""
-    sign = torch.where(coc < 0, -1.0, 1.0).to(coc.dtype)
-    return sign * (coc.abs() - SPREAD).clamp_min(0), sign * (coc.abs() + SPREAD)
+def layers_of(image: Tensor, coc: Tensor) -> tuple[Tensor, Tensor]:
+    """Two layers: a soft spot of the picture in front of the focus, and the picture mirrored behind it."""
+    height, width = image.shape[2:]
+    y, x = (torch.linspace(-1, 1, n, dtype=torch.float64, device=image.device) for n in (height, width))
+    alpha = (4 - 8 * torch.hypot(y[:, None], x).sub(0.3).clamp_min(0)).clamp(0, 1).to(image.dtype)
+    alpha = alpha.expand(len(image), 1, height, width)
+    front, back = torch.cat([image * alpha, alpha], 1), torch.cat([image.flip(-1), torch.ones_like(alpha)], 1)
+    return torch.stack([front, back], 1), torch.stack([-coc.abs(), coc.abs()], 1)
 
 
-def _coloured(spectrum: str, quality: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    out: Tensor = LensBlur(dispersing(image.shape[3], spectrum), quality=quality)(image, coc=coc)
-    return out
+def _picture(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc}
 
 
-def _coloured_plan(spectrum: str, quality: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> object:
-    return LensBlur(dispersing(image.shape[3], spectrum), quality=quality).plan(image, coc=coc)
+def _moving(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
+    return image, {"coc": coc, "motion": motion}
 
 
-def _approaching(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+def _layers(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
+    rgba, radius = layers_of(image, coc)
+    return rgba, {"coc": radius}
+
+
+def _moving_layers(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
+    """Layers that move in opposite ways."""
+    rgba, radius = layers_of(image, coc)
+    return rgba, {"coc": radius, "motion": torch.stack([motion, -motion], 1)}
+
+
+def _near(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
+    """The CoC is multiplied by four while the shutter is open."""
     return image, {"coc": coc, "motion": motion, "shutter_depth": torch.cat([coc / 2, 2 * coc], 1)}
 
 
-def _doubled(coc: Tensor) -> tuple[Tensor, Tensor]:
-    return coc / 2, 2 * coc
-
-
-def _curved(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+def _curved(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
     """Half of the motion, as much to its right, and a quarter of it back."""
-    assert motion is not None
     right = torch.stack([-motion[:, 1], motion[:, 0]], 1)
     return image, {"coc": coc, "motion": (motion / 2, right / 2, -motion / 4)}
 
 
-def _background(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+def _background(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
     return image, {"coc": coc, "background": (image.flip(-1), coc.abs())}
 
 
-def _margin(image: Tensor, coc: Tensor, motion: Tensor | None) -> tuple[Tensor, dict[str, Any]]:
+def _margin(image: Tensor, coc: Tensor, motion: Any) -> tuple[Tensor, dict[str, Any]]:
     """The picture goes on beyond the sensor, with its last pixels."""
     if image.numel():
         image, coc = (F.pad(t, (MARGIN,) * 4, mode="replicate") for t in (image, coc))
     return image, {"coc": coc}
 
 
-def _cut(coc: Tensor) -> tuple[Tensor, Tensor]:
-    cut = coc.clamp(-CUT_TO, CUT_TO)
-    return cut, cut
+def _samples(image: Tensor, coc: Tensor, motion: Any) -> tuple[torchbokeh.Samples, dict[str, Any]]:
+    """Samples in the middle of their pixels, of the lens and of the exposure: a plain picture."""
+    # Half precision cannot tell the columns of a wide picture apart.
+    position = pixel_positions(image.to(compute_dtype(image))).expand(len(image), 2, *image.shape[2:])
+    zero, present = torch.zeros_like(position), torch.ones_like(coc, dtype=torch.bool)
+    maps = image, position, zero, zero[:, :1], coc, motion, present
+    return torchbokeh.Samples(*(t[:, None] for t in maps)), {}
 
 
-def _moving_viewed(image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    assert motion is not None
-    return viewed(*layers_of(image, coc), VIEWS, torch.stack([motion, -motion], 1))
+def _dispersed(coc: Tensor) -> tuple[Tensor, ...]:
+    """Radii that differ from those of a CoC by `SPREAD`."""
+    sign = torch.where(coc < 0, -1.0, 1.0).to(coc.dtype)
+    return sign * (coc.abs() - SPREAD).clamp_min(0), sign * (coc.abs() + SPREAD)
 
 
-def _chromatic_views(spectrum: str, image: Tensor, coc: Tensor, motion: Tensor | None) -> Tensor:
-    buffer = ChromaticAccumulation(dispersing(image.shape[3], spectrum), views=VIEWS)
-    out: Tensor = call_with(buffer, layered, image, coc, motion)
-    return out
+def _doubled(coc: Tensor) -> tuple[Tensor, ...]:
+    return coc / 2, 2 * coc
+
+
+def _cut(coc: Tensor) -> tuple[Tensor, ...]:
+    return (coc.clamp(-CUT_TO, CUT_TO),)

@@ -16,40 +16,26 @@ pytest.importorskip("matplotlib")
 
 import torchbokeh.commands.psfs
 import torchbokeh.report.psfs.analysis
-import torchbokeh.report.psfs.splats
 from torchbokeh.commands.psfs import add_psfs
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.quadtree import quadtree
-from torchbokeh.psfs.refit import reconstruction
-from torchbokeh.psfs.similarity import centred
 from torchbokeh.report import chapters
 from torchbokeh.report.psfs.analysis import (
     METHODS,
     SHARES,
     Elimination,
     PsfSettings,
+    coordinates,
     covers,
     equal_sparsity,
     gaussian,
+    grid_errors,
     leaves,
     quality,
     random_psfs,
-)
-from torchbokeh.report.psfs.chapter import analyse, draw, markdown
-from torchbokeh.report.psfs.splats import (
-    beyond,
-    both,
-    coordinates,
-    grid_errors,
-    laplacian_samples,
-    many,
-    relative,
-    sample_of,
-    turned,
-    values_at,
     with_cells,
 )
+from torchbokeh.report.psfs.chapter import analyse, draw, markdown
 
 PSF = capsule(6.0, 9.0)
 
@@ -60,23 +46,16 @@ def silent(line):
 
 @pytest.fixture(scope="module")
 def found():
-    return analyse(PsfSettings.quick(), silent)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)  # as tests do: see the conftest of all
+    quick = analyse(PsfSettings.quick(), silent)
+    torch.set_num_threads(before)
+    return quick
 
 
 @pytest.fixture(scope="module")
 def elimination():
     return Elimination(PSF, "quadrants")
-
-
-@pytest.fixture(scope="module")
-def bank():
-    return PsfBank.load("combined")
-
-
-@pytest.fixture(scope="module")
-def thick(bank):
-    """A sample that is neither thin nor round."""
-    return sample_of(bank.model, int(bank.model.grid.index(torch.tensor([4.0, 15.0]))))
 
 
 def run(*flags):
@@ -86,9 +65,8 @@ def run(*flags):
     args.run(args)
 
 
-@pytest.mark.parametrize("module", [getattr(torchbokeh.report.psfs, name) for name in ("analysis", "splats")])
-def test_examples(module):
-    tried = doctest.testmod(module)
+def test_examples():
+    tried = doctest.testmod(torchbokeh.report.psfs.analysis)
     assert tried.attempted
     assert not tried.failed
 
@@ -223,61 +201,6 @@ def test_a_psf_in_the_middle_of_a_box_is_met_but_by_the_prefiltered_sample():
     middle, prefiltered, linear = grid_errors(model, tuple(model.grid.centres()[20].tolist()))[::2]
     assert middle == linear == pytest.approx(1.0)
     assert 0.2 < prefiltered < 0.999
-
-
-def test_values_at_places_are_those_of_the_picture(elimination):
-    sparse = elimination.within(60)
-    picture = reconstruction(sparse, (41, 61))[0]
-    y, x = np.mgrid[-20:21, -30:31]
-    values = values_at(sparse, np.stack([x.ravel(), y.ravel()], 1))[:, 0]
-    assert np.allclose(values.reshape(41, 61), picture, atol=1e-9)
-
-
-def test_nothing_beyond_a_box_is_larger_than_on_its_rim(elimination):
-    sparse = elimination.within(60)
-    y, x = np.abs(sparse.points).max(0)[::-1] + 8  # NEAR px, the nearest that is far
-    picture = np.abs(reconstruction(sparse, (161, 161))[0])
-    inner = np.s_[80 - y + 1 : 80 + y, 80 - x + 1 : 80 + x]
-    top = picture[inner].max()
-    picture[inner] = 0.0
-    assert beyond(sparse)[0] == pytest.approx(picture.max() / top, rel=1e-6)
-
-
-def test_the_far_field_falls_off(elimination):
-    found = beyond(elimination.within(60))
-    assert found == sorted(found, reverse=True)
-
-
-def test_a_picture_three_times_as_fine_is_brought_down_to_pixels():
-    fine = capsule(18.0, 27.0)[0]
-    assert np.allclose(turned(fine, 0.0, 15), centred(PSF, (31, 31))[0], atol=1e-8)
-
-
-def test_a_quarter_turn_only_moves_pixels():
-    fine = capsule(18.0, 27.0)[0] * np.linspace(0, 1, 63)
-    assert np.allclose(turned(fine, math.pi / 2, 15), np.rot90(turned(fine, 0.0, 15), -1), atol=1e-9)
-
-
-def test_a_turned_picture_keeps_its_light(thick):
-    assert turned(thick.fine, 0.5, 30).sum() == pytest.approx(1.0, abs=2e-3)
-
-
-def test_a_sample_turns_the_way_its_dense_psf_does(bank, thick):
-    splatted, dense = both(bank, thick, 0.5, 30)
-    assert relative(splatted, dense) < 0.08
-    assert relative(splatted, turned(thick.fine, -0.5, 30)) > 0.3
-
-
-def test_the_sum_of_one_splat_is_that_splat(bank, thick):
-    total = many(bank, [thick], 1, 16)
-    assert total["all"] == pytest.approx(total["one"], rel=0.05)  # more of what is far away is seen
-    assert total["expected"] == pytest.approx(math.sqrt(2 / math.pi) * total["one"], rel=1e-6)
-
-
-def test_laplacian_samples_are_all_of_them(bank):
-    chosen = laplacian_samples(bank)
-    assert all(bank.sample(int(k)).domain == "laplacian" for k in chosen[:: len(chosen) // 20])
-    assert len(chosen) == sum(bank.sample(k).domain == "laplacian" for k in range(len(bank)))
 
 
 def test_the_grid_of_the_model_is_left_alone():

@@ -43,10 +43,8 @@ def test_every_quality_and_radius_has_its_stages(tiny):
     assert {(row["quality"], row["radius"]) for row in rows} == {
         (quality, radius) for quality in module.QUALITY_NAMES for radius in tiny.photo_radii
     }
-    assert rows[0].keys() == {"quality", "radius", "stage", "seconds", "share", "least_seconds"}
-    bounded = [row for row in rows if row["least_seconds"] is not None]
-    assert {row["stage"] for row in bounded} >= {"mean", "collect", "picture"}
-    assert all(row["least_seconds"] > 0 for row in bounded)
+    assert rows[0].keys() == {"quality", "radius", "stage", "seconds", "share"}
+    assert {row["stage"] for row in rows} >= {"mean", "collect", "picture"}
 
 
 def test_without_kernels_there_are_none(monkeypatch, tiny):

@@ -1,6 +1,8 @@
 import re
 
-from torchbokeh.report.tables import markdown
+import pytest
+
+from torchbokeh.report.chapter import draw, markdown
 
 
 def test_a_report_has_every_section_and_whole_tables(report):
@@ -20,7 +22,6 @@ def test_a_report_has_every_section_and_whole_tables(report):
         "Dispersion against the truth",
         "Dispersion: run time against views",
         "Dispersion: bands of colour",
-        "Dispersion: importance sampling",
         "What a plan leaves out",
         "What the methods are",
     ]
@@ -46,6 +47,32 @@ def test_an_experiment_without_rows_has_no_section(report):
 
 
 def test_stages_are_shown_where_there_are_any(report):
-    row = {"quality": "exact", "radius": 25.0, "stage": "splat", "seconds": 0.1, "share": 0.8, "least_seconds": None}
+    row = {"quality": "exact", "radius": 25.0, "stage": "splat", "seconds": 0.1, "share": 0.8}
     found = {**report, "experiments": {**report["experiments"], "stages": [row]}}
-    assert "| exact | 25 | splat | 0.100 | 80% | - |" in markdown(found, [])
+    assert "| exact | 25 | splat | 0.100 | 80% |" in markdown(found, [])
+
+
+def test_there_is_a_plot_for_every_experiment(report):
+    pytest.importorskip("matplotlib")
+    assert list(draw(report)) == [
+        "one_layer_4.png",
+        "one_layer_recipes.png",
+        "truth.png",
+        "radius.png",
+        "pixels.png",
+        "layers.png",
+        "threads.png",
+        "chromatic.png",
+    ]
+
+
+def test_nothing_measured_draws_nothing(report):
+    pytest.importorskip("matplotlib")
+    assert draw({"experiments": {name: [] for name in report["experiments"]}}) == {}
+
+
+def test_axes_are_logarithmic_and_named(report):
+    pytest.importorskip("matplotlib")
+    axes = draw(report)["one_layer_4.png"].axes[0]
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("seconds", "1 - SSIM")

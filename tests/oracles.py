@@ -1,33 +1,195 @@
-"""Slow splats in double, by plain sums: what banks of sparse PSFs are compared with.
+"""Oracles in double: compositions and splats from banks written a second time, by plain sums.
 
-Which sample of a bank a pixel takes, where it lies and which pixels are highlights are read from the bank and its
-renderer: that is what is asked. How it is drawn is written anew, with no list of pixels, no running sum, no Fourier
-transform and no kernel of numba's.
+A plan says what is done: bins, sub-apertures, what fills hidden parts; a bank and its renderer say which sample a pixel
+takes, where it lies and which pixels are highlights. How it is done is written anew on top of
+`torchbokeh.ops.dense.dense_spans`: no list of pixels, no running sum, no Fourier transform, no fused pass, no special
+case for what is sharp or even. Only `pull_push` is shared.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from torchbokeh.ops.composite import TINY
+from torchbokeh import LensBlur, Plan, PsfBank
+from torchbokeh.banks.highlights import BRIGHT, ordinary_light, share_of_others
+from torchbokeh.compose.composition import CERTAIN
+from torchbokeh.ops.composite import TINY, pull_push
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.highlights import LEAST_CONTRAST
 from torchbokeh.ops.integrate import lattice_green
-from torchbokeh.ops.spans import MIN_RADIUS
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, area, subdivide
+from torchbokeh.plan.bins import FOREGROUND
 from torchbokeh.psfs.aperture import Disc
-from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels, Place
 from torchbokeh.psfs.represent import DOMAINS
-from torchbokeh.report.internals import BRIGHT, ordinary_light, share_of_others
 
 FINE = 2
 """Samples along each side of a pixel that the capsule of a highlight is drawn by (`torchbokeh.ops.capsules`)."""
 
 POINTS = 1 << 21
 """Points that are expanded at a time."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A surface.
+
+    Attributes:
+        colour: ``(B, C, H, W)``, premultiplied.
+        alpha: ``(B, 1, H, W)``.
+        coc: ``(B, 1, H, W)`` signed radius in px, everywhere.
+        bins: centres of its bins in px of CoC.
+        opaque: it covers everything.
+    """
+
+    colour: Tensor
+    alpha: Tensor
+    coc: Tensor
+    bins: tuple[float, ...]
+    opaque: bool = False
+
+
+def composed(blur: LensBlur, image: Tensor, coc: Tensor, background: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """What an exact `LensBlur` without a lens makes of one still picture, by definition.
+
+    Args:
+        blur: whose settings count.
+        image: ``(1, C, H, W)``, or layers ``(1, L, 4, H, W)``, float64.
+        coc: signed radius in px.
+        background: what the foreground hides, and its CoC.
+    """
+    plan = blur.plan(image, coc=coc, background=background)
+    mixed = [(plan, 1 - sum(share for _, share in plan.fading)), *plan.fading]
+    return torch.stack([share * _by_plan(other, blur, image, coc, background) for other, share in mixed]).sum(0)
+
+
+def _by_plan(plan: Plan, blur: LensBlur, image: Tensor, coc: Tensor, behind: tuple[Tensor, Tensor] | None) -> Tensor:
+    sheets = _given(image, coc, plan) if image.dim() == 5 else _split(image, coc, plan, behind)
+    if not sheets:
+        return torch.zeros_like(image[:, 0])
+    colour, covered = over(sheets, subdivide(blur.aperture.profile(), plan.subapertures))
+    return torch.cat([colour, covered], 1) if image.dim() == 5 else colour
+
+
+def over(sheets: Sequence[Sheet], pieces: Sequence[Profile]) -> tuple[Tensor, Tensor]:
+    """Sheets over one another, front to back, through every piece of the lens, and the mean of all pieces.
+
+    A piece has a say in a pixel as far as it knows what is there: where splats of a sheet without holes reach it.
+
+    Returns:
+        Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``.
+    """
+    sums: list[Tensor] = [torch.zeros_like(t) for t in (sheets[0].colour, sheets[0].coc, sheets[0].coc)]
+    for piece in pieces:
+        blurs = [blurred(sheet, piece) for sheet in sheets]
+        left = torch.full_like(sheets[0].coc, float(area(piece)))
+        votes: list[tuple[Tensor, Tensor, Tensor]] = []
+        known = left
+        for sheet, (mean, stopped, density) in zip(sheets, blurs, strict=True):
+            known = (CERTAIN * density).clamp(max=1)
+            votes.append((left * stopped * known, mean, density))
+            nothing = torch.zeros_like(left) if sheet.opaque else (sheet.alpha == 0).double()
+            left = left * (known * (1 - stopped) + (1 - known) * nothing)
+        total = torch.stack([vote for vote, _, _ in votes]).sum(0)
+        crowd = torch.stack([vote * density for vote, _, density in votes]).sum(0)
+        # Evenly lit whatever the blur does around: weighted by how dense the splats are that are seen.
+        dense = torch.where(total > TINY, crowd / total.clamp_min(TINY), blurs[-1][2])
+        seen = torch.stack([vote * mean for vote, mean, _ in votes]).sum(0)
+        for out, more in zip(sums, (dense * seen, dense * total, dense * (total + left * known)), strict=True):
+            out += more
+    whole = sums[2].clamp_min(TINY**2)
+    return sums[0] / whole, sums[1] / whole
+
+
+def blurred(sheet: Sheet, piece: Profile) -> tuple[Tensor, Tensor, Tensor]:
+    """A sheet through a piece of the lens: its mean colour, the share of light it stops, and how dense splats are."""
+    source = torch.cat([sheet.colour, sheet.alpha], 1)
+    hats = shares(sheet.coc, sheet.bins)
+    bins = dense_spans(torch.cat([source * hat for hat in hats], 1), sheet.coc, piece).chunk(len(hats), 1)
+    mean, coverage = filled(bins)
+    if sheet.opaque:
+        return mean, torch.ones_like(coverage), coverage
+    density = dense_spans(torch.ones_like(sheet.alpha), sheet.coc, piece).clamp_min(0)
+    return mean, (coverage / density.clamp_min(TINY)).clamp(max=1), density
+
+
+def filled(bins: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Bins, whose last channel is coverage, front to back until a pixel is full: mean colour, sum of coverages."""
+    taken, total = torch.zeros_like(bins[0][:, -1:]), torch.zeros_like(bins[0][:, -1:])
+    colour = torch.zeros_like(bins[0][:, :-1])
+    for found in bins:
+        coverage = found[:, -1:].clamp_min(0)
+        counts = torch.minimum(coverage, (1 - taken).clamp_min(0))
+        colour = colour + found[:, :-1] * counts / coverage.clamp_min(TINY)
+        taken, total = taken + counts, total + coverage
+    return colour / taken.clamp_min(TINY), total
+
+
+def shares(coc: Tensor, centres: Sequence[float]) -> list[Tensor]:
+    """Share of each pixel in each bin: hats that sum to 1."""
+    if len(centres) == 1:
+        return [torch.ones_like(coc)]
+    place = ((coc - centres[0]) / (centres[1] - centres[0])).clamp(0, len(centres) - 1)
+    return [(1 - (place - k).abs()).clamp_min(0) for k in range(len(centres))]
+
+
+def _given(layers: Tensor, coc: Tensor, plan: Plan) -> list[Sheet]:
+    """Those of the caller that hold anything."""
+    sheets = []
+    for k, bins in zip(plan.layers, plan.bins, strict=True):
+        colour, alpha = layers[:, k, :-1], layers[:, k, -1:]
+        sheets.append(Sheet(colour, alpha, gone_on(coc[:, k], alpha), bins, k in plan.opaque))
+    return sheets
+
+
+def _split(image: Tensor, coc: Tensor, plan: Plan, behind: tuple[Tensor, Tensor] | None) -> list[Sheet]:
+    """The picture, or what stands in front of its focus plane and the rest, with what is hidden filled in."""
+    if len(plan.bins) == 1:
+        return [Sheet(image, torch.ones_like(coc), coc, plan.bins[0], opaque=True)]
+    start, stop = FOREGROUND
+    front = ((stop - coc) / (stop - start)).clamp(0, 1)
+    around = F.pad(front, (1, 1, 1, 1))
+    height, width = coc.shape[2:]
+    near = torch.stack([around[..., y : y + height, x : x + width] for y in range(3) for x in range(3)])
+    known = 1 - near.amax(0)
+    weight = torch.maximum(known, 1e-9 * (1 - front))
+    fill, fill_coc = _hidden(image, coc, weight) if behind is None else behind
+
+    def rest(t: Tensor, hidden: Tensor) -> Tensor:
+        return known * t + (1 - known) * hidden
+
+    return [
+        Sheet(image * front, front, gone_on(coc, front), plan.bins[0]),
+        Sheet(rest(image, fill), torch.ones_like(coc), rest(coc, fill_coc), plan.bins[1], opaque=True),
+    ]
+
+
+def _hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Colour and CoC from the surroundings; highlights do not spread."""
+    usual = (image.abs() * weight).sum((2, 3), True) / weight.sum((2, 3), True).clamp_min(TINY)
+    excess = image.abs() / (4 * usual).clamp_min(TINY)
+    ordinary = torch.maximum(weight / (1 + excess.clamp(max=1e4) ** 4), 1e-9 * weight)
+    colours = [pull_push(image[:, c : c + 1], ordinary[:, c : c + 1]) for c in range(image.shape[1])]
+    return torch.cat(colours, 1), pull_push(coc, weight)
+
+
+def gone_on(t: Tensor, alpha: Tensor) -> Tensor:
+    """A map of a sheet, gone on from its surroundings to where the sheet is not."""
+    there = alpha > 0
+    return torch.where(there, t, pull_push(torch.where(there, t, 0.0), there.double()))
+
+
+def splatted(bank: PsfBank, image: Tensor, coc: Tensor) -> Tensor:
+    """What `KernelSplatting` with a bank that asks for no more than the CoC is by definition: float64."""
+    count = bank.values.shape[1]
+    source = torch.cat([image.double(), torch.ones_like(coc).double().expand(-1, count, -1, -1)], 1)
+    out = dense_bank(source, [Labels(coc.double())], bank)
+    return out[:, :-count] / out[:, -count:].clamp_min(TINY).repeat(1, image.shape[1] // count, 1, 1)
 
 
 def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor:

@@ -1,12 +1,14 @@
-"""What samples are worth: how near the next one is, how far it is seen, and how well it turns."""
+"""What samples of banks leave far away, and how well they turn: against closed forms and turned dense PSFs.
+
+``python -P tests/psfs/test_bank_samples.py`` prints what the guide says of them.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -15,12 +17,11 @@ from torchbokeh.ops.integrate import lattice_green, poisson_fft
 from torchbokeh.ops.points import splat_points
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.bank import PsfBank, installed
-from torchbokeh.psfs.combined import Combined
-from torchbokeh.psfs.model import PsfModel, mean_picture
-from torchbokeh.psfs.refit import Sparse, reconstruction
-from torchbokeh.psfs.represent import DOMAINS
-from torchbokeh.psfs.similarity import NEAR, centred, neighbourhood, score
-from torchbokeh.report.rows import Row, Say
+from torchbokeh.psfs.combined import Combined, capsule
+from torchbokeh.psfs.model import PsfModel
+from torchbokeh.psfs.refit import Fit, Sparse, reconstruction
+from torchbokeh.psfs.represent import DOMAINS, candidates
+from torchbokeh.psfs.similarity import NEAR, centred
 
 Array = NDArray[np.float64]
 
@@ -33,80 +34,17 @@ FINE = 3
 SEED = 0
 
 
-def coordinates(model: PsfModel) -> Iterator[tuple[float, ...]]:
-    """Random coordinates without end, spread as the samples are: a box of the grid, and a place in it."""
-    draw = np.random.default_rng(SEED)
-    boxes = np.array(model.grid.boxes(), dtype=np.float64)
-    while True:
-        place = draw.uniform(*boxes[draw.integers(len(boxes))])
-        yield tuple(model.grid.unmap(torch.from_numpy(place)).tolist())
-
-
-def with_cells(cells: int) -> Combined:
-    """`Combined` on a grid of another resolution."""
-    model = Combined()
-    model.axes = tuple(replace(axis, cells=cells) for axis in model.axes)
-    return model
-
-
-def sample_count(count: int, cells: Sequence[int], say: Say) -> list[Row]:
-    """Mean similarity of the dense PSF at the same random coordinates with what grids have for it.
-
-    That is the sample of its box, taken in the middle or pre-filtered, or linear interpolation between the middles.
-
-    Args:
-        count: coordinates, spread as the samples are.
-        cells: of each grid along each axis.
-        say: is told in a line what comes next.
-    """
-    rows = []
-    draw = coordinates(Combined())
-    places = [next(draw) for _ in range(count)]
-    for fineness in cells:
-        model = with_cells(fineness)
-        say(f"sample count: {len(model.grid)} samples")
-        found = np.array([grid_errors(model, place) for place in places]).mean(0)
-        names = [f"{way}{what}" for way in ("middle", "prefiltered", "linear") for what in ("", "_frame")]
-        rows.append({"cells": fineness, "samples": len(model.grid), **dict(zip(names, found.tolist(), strict=True))})
-    return rows
-
-
-def grid_errors(model: PsfModel, place: tuple[float, ...]) -> list[float]:
-    """Similarity near and in the frame of three stand-ins for a PSF, see `sample_count`."""
-    psf = model.dense(place)
-    where = torch.tensor(place, dtype=torch.float64)
-    centres = model.grid.centres()
-    pairs = [(model.dense(centres[int(k)].tolist()), float(share)) for k, share in model.grid.neighbours(where)]
-    number = int(model.grid.index(where))
-    stand_ins = [
-        model.dense(centres[number].tolist()),
-        model.prefiltered(*model.grid.box(number)),
-        mean_picture(*zip(*pairs, strict=True)),
-    ]
-    found = [score(psf, centred(picture, neighbourhood(psf))) for picture in stand_ins]
-    return [value for each in found for value in (each.ssim, each.ssim_frame)]
-
-
-def far_field(count: int, say: Say) -> list[Row]:
-    """What is seen far away of a spread of the Laplacian samples of every installed bank.
-
-    Args:
-        count: most samples of a bank.
-        say: is told in a line what comes next.
-
-    Returns:
-        For each bank and factor, mean and largest of `beyond`.
-    """
-    rows = []
+def far_field(count: int) -> dict[tuple[str, float], tuple[float, float]]:
+    """Mean and largest of `beyond` over up to so many Laplacian samples, for every installed bank and factor."""
+    found = {}
     for name in installed():
         bank = PsfBank.load(name)
         samples = laplacian_samples(bank)
         chosen = samples[np.unique(np.linspace(0, len(samples) - 1, min(count, len(samples))).astype(int))]
-        say(f"far field: {len(chosen)} samples of {name}")
-        found = [beyond(bank.sample(int(k)).sparse) for k in chosen]
-        for factor, values in zip(FACTORS, zip(*found, strict=True), strict=True):
-            rows.append({"bank": name, "factor": factor, "mean": float(np.mean(values)), "largest": max(values)})
-    return rows
+        seen = zip(*(beyond(bank.sample(int(k)).sparse) for k in chosen), strict=True)
+        for factor, values in zip(FACTORS, seen, strict=True):
+            found[name, factor] = float(np.mean(values)), max(values)
+    return found
 
 
 def laplacian_samples(bank: PsfBank) -> NDArray[np.int64]:
@@ -119,11 +57,6 @@ def beyond(sparse: Sparse) -> list[float]:
 
     Where there are no points, what they integrate to is harmonic, and vanishes at infinity: outside of a box it is
     largest on the box's rim.
-
-    Example:
-        >>> dipole = Sparse(np.array([[-1, 0], [1, 0]]), np.array([[1.0], [-1.0]]))
-        >>> [round(share, 3) for share in beyond(dipole)]
-        [0.098, 0.063, 0.049, 0.024]
     """
     half = np.abs(sparse.points).max(0)
     top = np.abs(reconstruction(sparse, (2 * int(half[1]) + 1, 2 * int(half[0]) + 1))).max()
@@ -164,7 +97,6 @@ class Sample(NamedTuple):
     fine: Array
 
 
-@lru_cache(maxsize=1)
 def random_samples(count: int, reach: int) -> tuple[Sample, ...]:
     """Laplacian samples of the bank of `Combined`, drawn at random, that reach no farther than so many px."""
     bank = PsfBank.load("combined")
@@ -174,27 +106,14 @@ def random_samples(count: int, reach: int) -> tuple[Sample, ...]:
     return tuple(sample_of(bank.model, int(k)) for k in draw.choice(samples, count, replace=False))
 
 
-def rotation(count: int, angles: int, reach: int, say: Say) -> list[Row]:
-    """Turn samples of the bank of `Combined` as a renderer does, and compare them with turned dense PSFs.
-
-    Args:
-        count: samples, drawn at random.
-        angles: how many angles from 0 to 45 degrees; symmetry does the others.
-        reach: of the largest sample, in px.
-        say: is told in a line what comes next.
-
-    Returns:
-        For each sample and angle, the relative L1 error.
-    """
+def rotation(chosen: Sequence[Sample], angles: int, reach: int) -> dict[float, list[float]]:
+    """Relative L1 errors of samples, turned as a renderer does it, by angles from 0 to 45 degrees."""
     bank = PsfBank.load("combined")
-    rows: list[Row] = []
-    for sample in sorted(random_samples(count, reach), key=lambda sample: sample.radius):
-        where = {"radius": sample.radius, "length": sample.length}
-        say(f"rotation: a sample of r = {sample.radius:.1f} px, l = {sample.length:.1f} px")
-        for angle in np.linspace(0, math.pi / 4, angles).tolist():
-            error = relative(*both(bank, sample, angle, half_of(reach)))
-            rows.append({**where, "degrees": math.degrees(angle), "l1": error})
-    return rows
+    turns = np.linspace(0, math.pi / 4, angles).tolist()
+    return {
+        math.degrees(angle): [relative(*both(bank, sample, angle, half_of(reach))) for sample in chosen]
+        for angle in turns
+    }
 
 
 def sample_of(model: PsfModel, number: int) -> Sample:
@@ -249,7 +168,7 @@ def relative(splatted: Array, dense: Array) -> float:
     return float(np.abs(splatted - dense).sum() / dense.sum())
 
 
-def many(bank: PsfBank, chosen: Sequence[Sample], splats: int, reach: int) -> Row:
+def many(bank: PsfBank, chosen: Sequence[Sample], splats: int, reach: int) -> dict[str, float]:
     """The sum of splats at random places, of random colours and rotations, in a square of twice the reach.
 
     Returns:
@@ -276,4 +195,107 @@ def many(bank: PsfBank, chosen: Sequence[Sample], splats: int, reach: int) -> Ro
         squares[window] += (colour[:, None, None] * (splatted - truth)) ** 2
     found = integrated(bank, values, index, matrices(angles), half)
     expected = math.sqrt(2 / math.pi) * float(np.sqrt(squares).sum() / dense.sum())
-    return {"splats": splats, "one": float(np.mean(errors)), "all": relative(found, dense), "expected": expected}
+    return {"one": float(np.mean(errors)), "all": relative(found, dense), "expected": expected}
+
+
+PSF = capsule(6.0, 9.0)
+
+
+@pytest.fixture(scope="module")
+def sparse() -> Sparse:
+    """A PSF of few points."""
+    fit = Fit(PSF, candidates(PSF, "quadrants"), "quadrants")
+    return fit.sparse(fit.elimination()[-15:])
+
+
+@pytest.fixture(scope="module")
+def bank() -> PsfBank:
+    return PsfBank.load("combined")
+
+
+@pytest.fixture(scope="module")
+def thick(bank: PsfBank) -> Sample:
+    """A sample that is neither thin nor round."""
+    return sample_of(bank.model, int(bank.model.grid.index(torch.tensor([4.0, 15.0]))))
+
+
+def test_a_dipole_falls_off() -> None:
+    dipole = Sparse(np.array([[-1, 0], [1, 0]]), np.array([[1.0], [-1.0]]))
+    assert [round(share, 3) for share in beyond(dipole)] == [0.098, 0.063, 0.049, 0.024]
+
+
+def test_no_sample_of_a_bank_is_seen_from_twice_its_half_side() -> None:
+    for (_, factor), (mean, largest) in far_field(8).items():
+        if factor >= 2:
+            assert mean < 4e-5
+            assert largest < 1.5e-4
+
+
+def test_turned_samples_are_near_turned_psfs() -> None:
+    chosen = random_samples(4, 16)
+    errors = rotation(chosen, 3, 16)
+    assert np.mean(errors[0.0]) < 0.05
+    assert all(np.mean(found) < 0.16 for found in errors.values())
+    assert many(PsfBank.load("combined"), chosen, 10, 16)["all"] < 0.1
+
+
+def test_values_at_places_are_those_of_the_picture(sparse: Sparse) -> None:
+    picture = reconstruction(sparse, (41, 61))[0]
+    y, x = np.mgrid[-20:21, -30:31]
+    values = values_at(sparse, np.stack([x.ravel(), y.ravel()], 1))[:, 0]
+    assert np.allclose(values.reshape(41, 61), picture, atol=1e-9)
+
+
+def test_nothing_beyond_a_box_is_larger_than_on_its_rim(sparse: Sparse) -> None:
+    y, x = np.abs(sparse.points).max(0)[::-1] + 8  # NEAR px, the nearest that is far
+    picture = np.abs(reconstruction(sparse, (161, 161))[0])
+    inner = np.s_[80 - y + 1 : 80 + y, 80 - x + 1 : 80 + x]
+    top = picture[inner].max()
+    picture[inner] = 0.0
+    assert beyond(sparse)[0] == pytest.approx(picture.max() / top, rel=1e-6)
+
+
+def test_the_far_field_falls_off(sparse: Sparse) -> None:
+    found = beyond(sparse)
+    assert found == sorted(found, reverse=True)
+
+
+def test_a_picture_three_times_as_fine_is_brought_down_to_pixels() -> None:
+    fine = capsule(18.0, 27.0)[0]
+    assert np.allclose(turned(fine, 0.0, 15), centred(PSF, (31, 31))[0], atol=1e-8)
+
+
+def test_a_quarter_turn_only_moves_pixels() -> None:
+    fine = capsule(18.0, 27.0)[0] * np.linspace(0, 1, 63)
+    assert np.allclose(turned(fine, math.pi / 2, 15), np.rot90(turned(fine, 0.0, 15), -1), atol=1e-9)
+
+
+def test_a_turned_picture_keeps_its_light(thick: Sample) -> None:
+    assert turned(thick.fine, 0.5, 30).sum() == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_sample_turns_the_way_its_dense_psf_does(bank: PsfBank, thick: Sample) -> None:
+    splatted, dense = both(bank, thick, 0.5, 30)
+    assert relative(splatted, dense) < 0.08
+    assert relative(splatted, turned(thick.fine, -0.5, 30)) > 0.3
+
+
+def test_the_sum_of_one_splat_is_that_splat(bank: PsfBank, thick: Sample) -> None:
+    total = many(bank, [thick], 1, 16)
+    assert total["all"] == pytest.approx(total["one"], rel=0.05)  # more of what is far away is seen
+    assert total["expected"] == pytest.approx(math.sqrt(2 / math.pi) * total["one"], rel=1e-6)
+
+
+def test_laplacian_samples_are_all_of_them(bank: PsfBank) -> None:
+    chosen = laplacian_samples(bank)
+    assert all(bank.sample(int(k)).domain == "laplacian" for k in chosen[:: len(chosen) // 20])
+    assert len(chosen) == sum(bank.sample(k).domain == "laplacian" for k in range(len(bank)))
+
+
+if __name__ == "__main__":
+    for (name, factor), (mean, largest) in far_field(60).items():
+        print(f"{name}, beyond {factor:g} half sides: mean {mean:.1e}, largest {largest:.1e}")
+    drawn = random_samples(16, 40)
+    for degrees, found in rotation(drawn, 7, 40).items():
+        print(f"turned by {degrees:g} degrees: mean error {np.mean(found):.3f}, largest {max(found):.3f}")
+    print("the sum of 200 splats:", many(PsfBank.load("combined"), drawn, 200, 40))

@@ -1,7 +1,11 @@
-"""What each mechanism is good for: the error without it, and with it, in float32."""
+"""What each mechanism of numerical stability is good for: the error without it, and with it, in float32.
+
+``python -P tests/stress/test_mechanisms.py`` prints them.
+"""
 
 import math
 from collections.abc import Iterator
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -9,26 +13,29 @@ import torch
 from torch import Tensor
 
 from torchbokeh import FFTIntegrator, KernelSplatting, PyramidIntegrator
+from torchbokeh.banks import highlights, samples
 from torchbokeh.ops.capsules import splat_capsules
+from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.convolve import convolve
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import laplacian, poisson_fft
 from torchbokeh.ops.splat import splat_spans
+from torchbokeh.picture.request import WIDEST
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.combined import Combined, capsule
 from torchbokeh.psfs.refit import drawn
-from torchbokeh.report.internals import WIDEST, bank_highlights, bank_samples, bank_splatting
-from torchbokeh.report.rows import Row
 from torchbokeh.report.stability.cases import even, slope
-from torchbokeh.report.stability.renderer import bank_of
-from torchbokeh.report.stability.rows import off
+from torchbokeh.report.stability.pictures import off
+from torchbokeh.report.stability.renderers import bank_of
+
+Row = dict[str, Any]
 
 
 def _row(mechanism: str, case: str, without: float | Tensor, kept: float | Tensor) -> Row:
     return {"mechanism": mechanism, "case": case, "without": float(without), "with": float(kept)}
 
 
-def mechanism_rows(side: int) -> Iterator[Row]:
+def mechanism_rows(side: int = 96) -> Iterator[Row]:
     """All of them, on pictures of about ``side`` px; errors are absolute, on a ground of 1, if nothing else is said."""
     yield _running_sum(side)
     yield _convolution(side)
@@ -89,8 +96,8 @@ def _highlights(side: int) -> Iterator[Row]:
         source = torch.cat([image, torch.ones_like(image)], 1)
         dense = splat_capsules(source, pixels, coc.flatten(), way[0].flatten(1).T.contiguous(), still)
         want, errors = dense[:, :1] / dense[:, 1:], []
-        for setting in (change[1], getattr(bank_highlights, change[0])):
-            with mock.patch.object(bank_highlights, change[0], setting):
+        for setting in (change[1], getattr(highlights, change[0])):
+            with mock.patch.object(highlights, change[0], setting):
                 errors.append(float((splatting(image, coc, motion=way) - want).abs().max() / want.max()))
         yield _row(name, f"error of a bokeh of {size} x {size} pixels of 3e5, of its maximum", *errors)
     yield _region(side)
@@ -102,8 +109,8 @@ def _region(side: int) -> Row:
     image[..., : side // 2, : side // 2] = 1000.0
     way = torch.tensor([5.0, -3.0]).view(1, 2, 1, 1).expand(1, 2, side, side).contiguous()
     splatting, leaks = KernelSplatting(quality="exact", bank=bank_of("combined")), []
-    for contrast in (math.inf, bank_highlights.CONTRAST):
-        with mock.patch.object(bank_highlights, "CONTRAST", contrast):
+    for contrast in (math.inf, highlights.CONTRAST):
+        with mock.patch.object(highlights, "CONTRAST", contrast):
             lit, dark = splatting(image, coc, motion=way), splatting(torch.ones_like(image), coc, motion=way)
         leaks.append(float((lit - dark)[..., side // 2 + 12 :, :].abs().max()))
     return _row("bright regions apart", "far-field leak of a region of 1000", *leaks)
@@ -150,7 +157,7 @@ def _normalisation(side: int) -> Iterator[Row]:
     yield _row("division by coverage", "a constant, radii that jump", *found)
     holes = splat_spans(image, even(side, side, 1e8).float(), profile, integrate=True)
     kept = splatting(image, even(side, side, 1e8).float())
-    lost = torch.where(holes < bank_splatting.TINY, 0.0, holes / holes)
+    lost = torch.where(holes < TINY, 0.0, holes / holes)
     yield _row(f"radii cut to {WIDEST:g} px", "a constant, radius 1e8", off(lost, 1), off(kept, 1))
 
 
@@ -172,8 +179,20 @@ def _confined(side: int) -> Row:
         sizes.append(1e-6 * buffer.shape[2] * buffer.shape[3])
         return poisson_fft(buffer, compact=compact)
 
-    with mock.patch.object(bank_samples, "poisson_fft", integrated):
+    with mock.patch.object(samples, "poisson_fft", integrated):
         for extreme in (False, True):
             with mock.patch.object(Combined, "needs_clipping", lambda *_, found=extreme: found):
                 KernelSplatting(quality="exact", bank=bank_of("combined"))(image, coc, motion=way)
     return _row("ways no longer than the picture asks for", f"Mpx of a buffer, {small} x {small} px", *sizes)
+
+
+def test_every_mechanism_is_of_use() -> None:
+    rows = list(mechanism_rows())
+    assert len(rows) >= 10
+    for found in rows:
+        assert found["with"] < 0.1 * found["without"], found["mechanism"]
+
+
+if __name__ == "__main__":
+    for found in mechanism_rows():
+        print("{mechanism}; {case}: {without:.2g} without, {with:.2g} with".format(**found))
