@@ -79,18 +79,20 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     if image.numel() == 0:
         raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
     size, background = (image.shape[-2], image.shape[-1]), request.background is not None
-    motion, pan, approach = _look_at_motion(image, request.motion)
     if not request.layered:
+        motion, pan, approach = _look_at_motion(image, request.motion)
         clamped = coc.new_zeros(()) if request.clamped is None else request.clamped.to(coc.dtype).mean()
         found = [*coc.aminmax(), clamped, *merged_shares(coc, settings.quality, settings.tolerance)]
         low, high, share, *shares = torch.stack(found).tolist()
         return Look(size, (low,), (high,), share, tuple(shares), 0, (), (), background, motion, pan, approach)
     there = image[:, :, 3:] > 0
+    # A product: what is not finite is refused, wherever it is.
+    motion, pan, approach = _look_at_motion(image, request.motion.mapped(lambda t: t * there))
     lows = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1)
     highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
     cut = request.clamped
     clamped = lows.new_zeros(()) if cut is None else (cut & there).sum() / there.sum().clamp_min(1)
-    merging = merged_shares(torch.where(there, coc, 0.0), settings.quality, settings.tolerance)
+    merging = merged_shares(coc, settings.quality, settings.tolerance, there)
     least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(lows.dtype)
     numbers = torch.cat([lows, highs, least, torch.stack([clamped.to(lows.dtype), *merging])]).tolist()
     bounds, (share, *shares) = numbers[: -len(QUALITIES) - 1], numbers[-len(QUALITIES) - 1 :]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torchbokeh.ops.merge import Merging
@@ -75,18 +76,21 @@ def check_quality(quality: object, tolerance: object) -> None:
         raise ValueError(f"tolerance: expected a relative error of at least 0, got {tolerance}")
 
 
-def merged_shares(coc: Tensor, quality: str, tolerance: float | None) -> list[Tensor]:
+def merged_shares(coc: Tensor, quality: str, tolerance: float | None, there: Tensor | None = None) -> list[Tensor]:
     """Share of the pixels of ``coc`` whose radius is large enough to be merged, for every operating point.
 
-    Those that `choose` will not look at are left out, as 0.
+    Those that `choose` will not look at are left out, as 0; so are pixels that ``there`` says are not.
     """
     radius = coc.abs()
+    count: Tensor | int = radius.numel()
+    if there is not None:
+        radius, count = torch.where(there, radius, 0.0), there.sum().clamp_min(1)
     shares = []
     for point in QUALITIES:
         if point.merging is None or (tolerance is None and point.name != quality):
             shares.append(radius.new_zeros(()))
         else:
-            shares.append((radius >= 2 * point.merging.cells).sum() / radius.numel())
+            shares.append((radius >= 2 * point.merging.cells).sum() / count)
     return shares
 
 

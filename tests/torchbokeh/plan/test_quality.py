@@ -65,6 +65,8 @@ def test_a_tolerance_takes_the_fastest_point_that_keeps_to_it() -> None:
 def test_shares_count_what_is_merged() -> None:
     coc = torch.tensor([0.0, -4.9, 5.0, 7.9, -8.0, 15.9, 16.0, -100.0]).view(1, 1, 2, 4)
     assert [round(s.item() * 8) for s in merged_shares(coc, "exact", 0.1)] == [0, 2, 4, 6]
+    twice, there = torch.cat([coc, coc]), torch.cat([coc * 0 + 1, coc * 0]) > 0
+    assert merged_shares(twice, "exact", 0.1, there) == merged_shares(coc, "exact", 0.1)
     assert [round(s.item() * 8) for s in merged_shares(coc, "balanced", None)] == [0, 0, 4, 0]
 
 
