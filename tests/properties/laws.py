@@ -1,5 +1,6 @@
 """All laws, in one list."""
 
-from . import laws_of_change, laws_of_form, laws_of_light, laws_of_place
+from . import laws_of_change, laws_of_form, laws_of_light, laws_of_place, laws_of_programs
 
-LAWS = (*laws_of_light.LAWS, *laws_of_place.LAWS, *laws_of_form.LAWS, *laws_of_change.LAWS)
+ROOMS = laws_of_light, laws_of_place, laws_of_form, laws_of_change, laws_of_programs
+LAWS = tuple(law for room in ROOMS for law in room.LAWS)

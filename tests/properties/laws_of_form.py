@@ -197,7 +197,7 @@ LAWS = (
         "Without blur, the picture is the input.",
         without_blur,
         unchanged,
-        lambda s: at_quality(s, 1e-6, 1e-6, 1e-5),
+        lambda s: at_quality(s, 1e-6, 1e-6, 1e-5, 1e-5),
     ),
     Law("threads", "The number of threads changes no bit.", anything, by_threads, 0.0, tries=40),
     Law(

@@ -26,6 +26,8 @@ BROKEN: dict[str, str] = {
 FOUND: list[tuple[str, Scene]] = [
     ("empty layer", Scene(size=(1, 32), radius=9.0, layers=1, alpha="opaque", tolerance=0.01)),
     ("empty layer", Scene(size=(2, 33), coc="ramp", layers=1, alpha="soft", motion="anywhere", speed=0.68)),
+    ("compiled", Scene(coc="constant", radius=10.0)),
+    ("exported", Scene(renderer="KernelSplatting", coc="constant", radius=10.0)),
 ]
 """Scenes that broke a law once."""
 
