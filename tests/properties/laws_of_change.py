@@ -50,8 +50,10 @@ def by_tolerance(scene: Scene) -> Scene | None:
 
 
 def composed(scene: Scene) -> float:
-    """The relative L1 error of a quality where something hides something."""
+    """The relative L1 error of a quality where something hides something, and something opaque is behind it."""
     inputs = scene.inputs()
+    if scene.layers:
+        inputs.image[:, -1, 3:] = 1
     return light_error(picture(scene, inputs), exactly(scene, inputs))
 
 
@@ -197,7 +199,7 @@ LAWS = (
         changing,
         jump,
         smallest_step,
-        tries=12,
+        tries=8,
     ),
     Law(
         "gradient",
@@ -205,6 +207,6 @@ LAWS = (
         smooth,
         slope_error,
         1e-5,
-        tries=20,
+        tries=10,
     ),
 )

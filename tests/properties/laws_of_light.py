@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .law import PROMISED, Law, anything, at_quality, light_error, peak_error
+from .law import PROMISED, Law, anything, at_quality, light_error, peak_error, promised
 from .renderers import picture, plan, planned
 from .scenes import Inputs, Scene
 
@@ -171,7 +171,7 @@ def channels_alone(scene: Scene) -> float:
 def of_channels(scene: Scene) -> Scene | None:
     if scene.lens in ("rgb", "continuous") or scene.bank in COLOURED:
         return None
-    return None if scene.renderer not in ("LensBlur", "KernelSplatting") else replace(scene, layers=0)
+    return None if scene.renderer not in ("LensBlur", "KernelSplatting") else replace(promised(scene), layers=0)
 
 
 def merging(scene: Scene) -> float:
@@ -207,7 +207,7 @@ LAWS = (
         "No light is taken away; depth of the darkest over the brightest pixel.",
         anything,
         negative,
-        1e-6,
+        lambda s: at_quality(s, 1e-6, 1e-6, 1e-4),
     ),
     Law("no brighter", "A picture is a mean: nothing is brighter than the brightest.", one_colour, brighter, 1e-4),
     Law("homogeneous", "128 times the light is 128 times the picture.", anything, homogeneous, 1e-5),

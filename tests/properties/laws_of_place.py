@@ -91,7 +91,7 @@ def movable(scene: Scene) -> Scene | None:
 
 def merged_or_bank(scene: Scene) -> float:
     if scene.bank != "none" or scene.renderer == "reconstruct" or scene.motion != "none":
-        return 0.01 + PROMISED["fast" if scene.tolerance else scene.quality]
+        return 0.1 + PROMISED["fast" if scene.tolerance else scene.quality]
     return 1e-5 + 2 * PROMISED["fast" if scene.tolerance else scene.quality]
 
 

@@ -42,12 +42,16 @@ def laws() -> list[object]:
 
 
 def quick(scene: Scene) -> Scene:
-    """The same with less of what takes long, and motion and banks in some scenes only."""
-    scene = replace(scene, layers=min(scene.layers, 2), batch=min(scene.batch, 2), radius=min(scene.radius, 10.0))
-    scene = replace(scene, size=(min(scene.size[0], 19), min(scene.size[1], 24)), speed=min(scene.speed, 6.0))
-    lens, some = "rgb" if scene.lens == "continuous" else scene.lens, scene.seed % 4
+    """The same with less of what takes long: motion, banks and many layers are in some scenes only."""
+    scene = replace(scene, batch=min(scene.batch, 2), radius=min(scene.radius, 10.0), speed=min(scene.speed, 6.0))
+    scene = replace(scene, size=(min(scene.size[0], 17), min(scene.size[1], 19)))
+    some = scene.seed % 8
+    scene = replace(scene, layers=min(scene.layers, 1 + (some == 2)))
+    lens = scene.lens if scene.lens not in ("rgb", "continuous") else "rgb" if some == 3 else "none"
+    if scene.bank != "none" and some > 3:
+        scene = replace(scene, bank="none", motion="none")
     motion = scene.motion if some == 0 or scene.bank == "combined" else "none"
-    return replace(scene, lens=lens, motion=motion, approach=min(scene.approach, 3.0) if some == 1 else 0.0)
+    return replace(scene, lens=lens, motion=motion, approach=min(scene.approach, 1.5) if some == 1 else 0.0)
 
 
 def keeps(law: Law, scene: Scene) -> None:
