@@ -207,6 +207,6 @@ LAWS = (
         smooth,
         slope_error,
         1e-5,
-        tries=10,
+        tries=8,
     ),
 )

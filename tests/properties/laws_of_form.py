@@ -199,7 +199,7 @@ LAWS = (
         unchanged,
         lambda s: at_quality(s, 1e-6, 1e-6, 1e-5, 1e-5),
     ),
-    Law("threads", "The number of threads changes no bit.", anything, by_threads, 0.0, tries=30),
+    Law("threads", "The number of threads changes no bit.", anything, by_threads, 0.0, tries=15),
     Law(
         "double",
         "Single precision is double precision but for rounding; relative L1.",
