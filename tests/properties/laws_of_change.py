@@ -16,19 +16,24 @@ def exactly(scene: Scene, inputs: Inputs) -> Tensor:
     return picture(replace(scene, quality="exact", tolerance=None), inputs)
 
 
+def off_splats(scene: Scene) -> float:
+    """The relative L1 error of one surface in one bin: promises are those of splats, not of what they compose."""
+    inputs, settings = scene.inputs(), {"layers": 1} if scene.renderer == "LensBlur" else {}
+    exact = replace(scene, quality="exact", tolerance=None)
+    wanted = picture(exact, inputs, module(exact, **settings))
+    return light_error(picture(scene, inputs, module(scene, **settings)), wanted)
+
+
 def of_promise(scene: Scene) -> float:
     """The error of a quality as a share of what its plan predicts."""
-    inputs = scene.inputs()
-    predicted = plan(scene, inputs).predicted_error
-    error = light_error(picture(scene, inputs), exactly(scene, inputs))
-    return error / predicted if predicted else error / 1e-6
+    predicted = plan(scene, scene.inputs()).predicted_error
+    return off_splats(scene) / (predicted or 1e-6)
 
 
 def of_tolerance(scene: Scene) -> float:
     """The error as a share of the tolerance."""
-    inputs = scene.inputs()
     assert scene.tolerance is not None
-    return light_error(picture(scene, inputs), exactly(scene, inputs)) / scene.tolerance
+    return off_splats(scene) / scene.tolerance
 
 
 def by_splats(scene: Scene) -> Scene | None:
