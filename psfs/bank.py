@@ -116,7 +116,10 @@ class PsfBank(nn.Module):
                 sizes = self.counts.diff()
                 chosen = here.repeat_interleave(sizes)
                 counts = torch.cat([sizes.new_zeros(1), torch.where(here, sizes, 0).cumsum(0)]).long()
-                self._tables[key] = PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts)
+                found = PointTable(self.offsets[chosen].float(), self.values[chosen, channel], counts)
+            if torch._C._functorch.is_functorch_wrapped_tensor(found[0]):
+                return found  # a transform of torch.func took part in it: nobody else may have it
+            self._tables[key] = found
         return self._tables[key]
 
     def dense(self, used: Tensor, fine: int = 1) -> "PsfBank":

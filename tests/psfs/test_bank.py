@@ -64,6 +64,12 @@ def test_tables_hold_the_samples_of_one_domain(small: PsfBank) -> None:
         assert sum(s > 0 for s in sizes) == 1
 
 
+def test_a_transform_leaves_nothing_of_its_own_in_a_table() -> None:
+    bank = PsfBank.load("simple-lens")
+    torch.func.grad(lambda t: t * bank.table("laplacian").weights.sum())(torch.ones(()))
+    assert not torch._C._functorch.is_functorch_wrapped_tensor(bank.table("laplacian").weights)
+
+
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_gains_are_the_light_of_a_sample(domain: str) -> None:
     psf = np.concatenate([capsule(3.0, 4.0), 0.25 * capsule(3.0, 4.0), 2 * capsule(3.0, 4.0)])

@@ -27,9 +27,12 @@ def sharp(request: Request, plan: Plan, pieces: Pieces) -> Tensor:
 
 
 def uniform(request: Request, plan: Plan, pieces: Pieces) -> Tensor:
-    """One convolution for all pixels; where a gradient asks for radii or ways, each pixel has its own."""
+    """One convolution for all pixels; where a gradient asks for radii or ways, each pixel has its own.
+
+    So it has for a compiler, which cannot say how large a PSF is.
+    """
     image, (lens,), radius = request.image, pieces[1], plan.coc_range[0]
-    if any(t.requires_grad for t in (request.coc, *request.motion.maps)):
+    if torch.compiler.is_compiling() or any(t.requires_grad for t in (request.coc, *request.motion.maps)):
         return surface(request, plan, pieces)
     if not plan.moves or plan.pan is None:
         return blur_uniform(image, radius, lens)

@@ -82,8 +82,8 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     if image.numel() == 0:
         raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
     size, background = (image.shape[-2], image.shape[-1]), request.background is not None
-    motion, pan, approach = _look_at_motion(image, request.motion)
     if not request.layered:
+        motion, pan, approach = _look_at_motion(image, request.motion)
         clamped = coc.new_zeros(()) if request.clamped is None else request.clamped.to(coc.dtype).mean()
         expected = [] if settings.tolerance is None else predict_errors(image, coc)
         found = [t.to(coc.dtype) for t in (*coc.aminmax(), clamped, *expected)]
@@ -91,6 +91,8 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
         lights = lights_at_border(image, coc, max(-low, high), motion + approach)
         return Look(size, (low,), (high,), share, tuple(errors), 0, (), (), background, motion, pan, approach, lights)
     there = image[:, :, 3:] > 0
+    # A product: what is not finite is refused, wherever it is.
+    motion, pan, approach = _look_at_motion(image, request.motion.mapped(lambda t: t * there))
     lows = torch.where(there, coc, torch.inf).movedim(1, 0).flatten(1).amin(1)
     highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
     cut = request.clamped

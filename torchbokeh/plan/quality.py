@@ -97,12 +97,8 @@ def predict_errors(image: Tensor, coc: Tensor) -> list[Tensor]:
         coc: ``(B, ..., 1, H, W)`` signed radius in px; NaN where there is nothing.
     """
     magnitude = image.abs()
-    light = (
-        (magnitude / magnitude.amax().clamp_min(torch.finfo(image.dtype).tiny))
-        .float()
-        .mean(-3)
-        .reshape(-1, 1, *image.shape[-2:])
-    )
+    unit = magnitude.amax().clamp_min(torch.finfo(image.dtype).tiny)
+    light = (magnitude / unit).float().mean(-3).reshape(-1, 1, *image.shape[-2:])
     radius = coc.float().reshape_as(light)
     total = light.sum((1, 2, 3)).clamp_min(TINY)
     uneven = (_spread(light) / total + _jumps(radius)).clamp(max=1)

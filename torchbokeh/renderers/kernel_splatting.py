@@ -225,7 +225,7 @@ class KernelSplatting(nn.Module):
         if self.bank is not None and labels is not None:
             settings = self.bank, plan.quality.merging, plan.highest
             return blur_with_bank(image, labels, *settings, interpolate=self.interpolate)
-        if plan.uniform is not None and not coc.requires_grad:
+        if plan.uniform is not None and not coc.requires_grad and not torch.compiler.is_compiling():
             return blur_uniform(image, plan.uniform, profile)
         return blur_one_layer(image, coc, profile, plan.detail)
 

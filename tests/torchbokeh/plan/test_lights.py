@@ -61,7 +61,7 @@ def test_surroundings_come_gradually() -> None:
     assert shares[-1] == 1
     assert any(0 < s < 1 for s in shares)
     change = torch.stack(pictures).diff(dim=0).abs().amax((2, 3, 4))
-    assert (change.amax(0) < 4 * change.amin(0)).all()  # light comes in with each step, and no more at one than at others
+    assert (change.amax(0) < 4 * change.amin(0)).all()  # no step brings much more than others
 
 
 def test_the_plan_says_what_is_assumed() -> None:
