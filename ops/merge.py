@@ -32,18 +32,22 @@ from torch.nn import functional as F
 from torchbokeh.ops.checks import check_flag, check_image, check_kind, check_whole
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_transforms
+from torchbokeh.ops.highlights import LEAST_CONTRAST, ordinary_brightness
 from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, working_dtype
 from torchbokeh.ops.splat import splat_spans
 
 FADE = 0.125
 """Radii from one to ``1 + FADE`` times the least radius of a level belong partly to the level below."""
 
-STEPS = 64
-"""Mean radii are rounded to this fraction of a cell, and those of pixels from `EVEN` px on: few PSFs are drawn."""
+STEPS = 9216
+"""Radii in cells are rounded, so that few PSFs are drawn: small ones to steps of ``1 / radius``, this many to 1, since
+the weights of small PSFs change fast: by up to 2e-4 from one step to the next."""
 
-EVEN = 12.0
-"""Smaller radii, in cells, take steps in proportion to their square, as the weights of small PSFs change faster: by up
-to 2e-4 from one step to the next."""
+EVEN = 4.6
+"""From this radius on steps grow with its square root: half a step moves 1e-3 of the light at most."""
+
+ROUNDED_TO = 32.0
+"""Larger radii are not rounded: their PSFs are too large to be kept."""
 
 MARGIN = 2
 """Cells around the picture of a level: interpolation at the border looks beyond it."""
@@ -53,10 +57,6 @@ SPREAD = 2 / 3
 
 FEWEST = 16
 """Cells across the longer side of the coarsest level. From there on, the height of the picture bounds the cost."""
-
-LEAST_CONTRAST = 4.0
-"""A highlight is at least this many times as bright as the mean."""
-
 
 MOST_LEVELS = 32
 
@@ -87,13 +87,11 @@ def level_shares(
 ) -> list[Tensor]:
     """Share ``(B, 1, H, W)`` of every pixel in the levels ``0 .. highest``; the shares of a pixel sum to 1.
 
-    They are a choice, not a part of the picture: no gradient runs through them. What is a highlight is told by the mean
-    of the picture, in which a pixel counts by its weight: black ones do as well, or lights before black would be none.
+    They are a choice, not a part of the picture: no gradient runs through them.
     """
     values, radius = values.detach(), coc.detach().to(working_dtype(coc.device)).abs()
     counted = torch.ones_like(values[:, :1]) if weight is None else weight.detach().to(values.dtype)
-    magnitude = torch.where(counted > 0, values.abs() * counted, 0.0)
-    mean = magnitude.sum((2, 3), keepdim=True) / counted.sum((2, 3), keepdim=True).clamp_min(TINY)
+    mean = ordinary_brightness(values, counted)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
     ordinary = ~(values.abs() > mean * bound).any(1, keepdim=True)
     above = [torch.ones_like(radius)]
@@ -105,12 +103,13 @@ def level_shares(
 
 
 def rounded(radius: Tensor) -> Tensor:
-    """Radii in cells, rounded to steps (see `STEPS` and `EVEN`); those of the identity are kept."""
-    most, even = 1 / MIN_RADIUS, EVEN**2 * (1 / MIN_RADIUS - 1 / EVEN)
-    number = EVEN**2 * (most - 1 / radius.clamp(MIN_RADIUS, EVEN)) + (radius - EVEN).clamp_min(0)
-    number = (number * STEPS).round() / STEPS
-    graded = 1 / (most - number.clamp_max(even) / EVEN**2)
-    return torch.where(radius > MIN_RADIUS, graded + (number - even).clamp_min(0), radius)
+    """Radii in cells, rounded to steps (see `STEPS` and `EVEN`); those of the identity are kept, and large ones."""
+    last, root = 1 / MIN_RADIUS - 1 / EVEN, EVEN**0.5
+    above = (radius.clamp_min(EVEN).sqrt() - root) * 2 / root**3
+    number = ((1 / MIN_RADIUS - 1 / radius.clamp(MIN_RADIUS, EVEN) + above) * STEPS).round() / STEPS
+    small = 1 / (1 / MIN_RADIUS - number.clamp_max(last))
+    graded = torch.where(number < last, small, (root + (number - last) * root**3 / 2).square())
+    return torch.where((radius > MIN_RADIUS) & (radius < ROUNDED_TO), graded, radius)
 
 
 def merge_cells(
@@ -151,7 +150,7 @@ def merge_cells(
         if level:
             radius = (radius.square() - SPREAD).clamp_min(MIN_RADIUS**2).sqrt()
         exact = radius.detach().to(working_dtype(coc.device))
-        step = rounded((exact * STEPS).round() / STEPS if level else exact)
+        step = rounded(exact)
         radius = radius + (step.to(radius.dtype) - radius.detach())
         factor = share if weight is None else share * torch.where(weight > 0, weight, 0.0)
         # What is infinite stays on its own levels.

@@ -27,13 +27,12 @@ from torchbokeh.ops.kernels.radius_bank import (
     number_of,
     psf_buffer,
     radius_bank,
-    radius_of,
     rounded,
     rows_within,
 )
 from torchbokeh.ops.kernels.rows import draw_rows, running_sum
 from torchbokeh.ops.kernels.splat import clamped, row_range, shape_of
-from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, STEPS, Merging
+from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.system.threads import run_all, stage
 
@@ -99,12 +98,6 @@ def coarser(coarse, y, margin, line, fine):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def cell_number(radius):  # type: ignore[no-untyped-def]
-    """The number of the PSF that stands for the mean radius of a cell: rounded before, as in `merge.merge_cells`."""
-    return number_of(np.rint(STEPS * radius) / STEPS)
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
 def cell_radius(cells, p, scale):  # type: ignore[no-untyped-def]
     """Mean radius of a cell in cells of its level, less what interpolation will add."""
     mean = scale * (cells[p + 5] / cells[p + 4])
@@ -145,7 +138,8 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
         p = RECORD * (start + j * across)
         for i in range(across):
             if cells[p] != 0.0 or cells[p + 1] != 0.0 or cells[p + 2] != 0.0 or cells[p + 3] != 0.0:
-                number = cell_number(cell_radius(cells, p, scale))
+                radius = cell_radius(cells, p, scale)
+                number = number_of(radius)
                 if number < in_bank:
                     k = int(number)
                     if cells[p + 6] < 0.0:
@@ -154,7 +148,7 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
                     o = (first - y0) * stride + 4 * (pad + MARGIN + i)
                     draw_rows(sums, o, stride, cells, p, bank_rows, span)
                 else:
-                    coc = math.copysign(radius_of(number), cells[p + 6])
+                    coc = rounded(math.copysign(radius, cells[p + 6]))
                     _draw_wide(band, pad, cells, p, i + MARGIN, y, coc, buffer)
             p += RECORD
     scratch = interpolation_rows(coarse, out.shape[1])

@@ -8,7 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import FADE, LEAST_CONTRAST, Merging
+from torchbokeh.ops.highlights import LEAST_CONTRAST
+from torchbokeh.ops.merge import FADE, Merging
 from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
@@ -251,7 +252,7 @@ def _row_sums(values, weight, sums, y0, y1):  # type: ignore[no-untyped-def]
 
 
 def channel_means(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Mean magnitude ``(C,)`` of every channel, by the weight of its pixels: highlights are far above it."""
+    """`torchbokeh.ops.highlights.ordinary_brightness` ``(C,)`` of one picture."""
     sums = np.empty((values.shape[1], len(values) + 1))
     run_all(partial(_row_sums, values, weight, sums), bands(values.shape[1]), "mean")
     *totals, count = sums.sum(0)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge import bank_for, cell_number, cell_radius
+from torchbokeh.ops.kernels.merge import bank_for, cell_radius
 from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, bands, classify, collect
 from torchbokeh.ops.kernels.radius_bank import (
     RadiusBank,
@@ -22,7 +22,6 @@ from torchbokeh.ops.kernels.radius_bank import (
     draw_slopes,
     number_of,
     psf_buffer,
-    radius_of,
     rounded,
     rows_within,
 )
@@ -144,7 +143,7 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
             if cells[p + 4] == 0.0:
                 continue
             smaller = cell_radius(cells, p, scale)
-            number = cell_number(smaller)
+            number = number_of(smaller)
             if number < in_bank:
                 k = int(number)
                 if cells[p + 6] < 0.0:
@@ -152,7 +151,7 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
                 first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
                 gather_rows(sums, first * stride + 4 * (pad + MARGIN + i), stride, bank_rows, span, found)
             else:
-                coc = math.copysign(radius_of(number), cells[p + 6])
+                coc = rounded(math.copysign(smaller, cells[p + 6]))
                 _gather_wide(sums, pad, i + MARGIN, y, coc, buffer, found)
             slope = 0.0
             for k in range(4):

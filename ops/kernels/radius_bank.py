@@ -8,11 +8,13 @@ import numpy as np
 
 from torchbokeh.ops.kernels.rows import PsfRows
 from torchbokeh.ops.kernels.splat import Shape, row_slopes, row_table
-from torchbokeh.ops.merge import EVEN, STEPS
+from torchbokeh.ops.merge import EVEN, ROUNDED_TO, STEPS
 from torchbokeh.ops.spans import MIN_RADIUS
 
-LAST = EVEN * EVEN * (1.0 / MIN_RADIUS - 1.0 / EVEN)
+LAST = 1.0 / MIN_RADIUS - 1.0 / EVEN
 """Number of the PSF with the radius `EVEN`, in units of `STEPS`."""
+
+ROOT = EVEN**0.5
 
 
 class RadiusBank(NamedTuple):
@@ -56,19 +58,21 @@ def psf_buffer(shape, n):  # type: ignore[no-untyped-def]
 def number_of(radius):  # type: ignore[no-untyped-def]
     """The number of the PSF in a bank that stands for a radius, as a float: see `torchbokeh.ops.merge.rounded`."""
     graded = 1.0 / MIN_RADIUS - 1.0 / min(max(radius, MIN_RADIUS), EVEN)
-    return np.rint(STEPS * (EVEN * EVEN * graded + max(radius - EVEN, 0.0)))
+    return np.rint(STEPS * (graded + (math.sqrt(max(radius, EVEN)) - ROOT) * (2.0 / ROOT**3)))
 
 
 @nb.njit(inline="always")
 def radius_of(number):  # type: ignore[no-untyped-def]
     """The radius of a PSF of a bank, at least `MIN_RADIUS`."""
-    return 1.0 / (1.0 / MIN_RADIUS - min(number / STEPS, LAST) / (EVEN * EVEN)) + max(number / STEPS - LAST, 0.0)
+    graded = number / STEPS
+    return 1.0 / (1.0 / MIN_RADIUS - graded) if graded < LAST else (ROOT + (graded - LAST) * (0.5 * ROOT**3)) ** 2
 
 
 @nb.njit(inline="always")
 def rounded(coc):  # type: ignore[no-untyped-def]
     """The CoC with its radius rounded to one that a bank would hold."""
-    return math.copysign(radius_of(number_of(abs(coc))), coc)
+    r = abs(coc)
+    return math.copysign(radius_of(number_of(r)), coc) if r < ROUNDED_TO else coc
 
 
 @nb.njit(inline="always")

@@ -16,13 +16,14 @@ from torch.nn import functional as F
 
 import torchbokeh.ops.merge
 from torchbokeh.ops import dispatch
+from torchbokeh.ops.highlights import LEAST_CONTRAST
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import (
     EVEN,
     FADE,
     FEWEST,
-    LEAST_CONTRAST,
     MARGIN,
+    ROUNDED_TO,
     SPREAD,
     STEPS,
     Merging,
@@ -230,15 +231,15 @@ def test_shares_pass_no_gradient_on() -> None:
 # The cells.
 
 
-def round_radius(radius: float, level: int) -> float:
-    """To steps of ``1 / STEPS`` from `EVEN` on; below, to steps of even ``1 / radius``; no radius of the identity."""
-    if level > 0:
-        radius = round(radius * STEPS) / STEPS
-    if radius <= 0.5:
+def round_radius(radius: float) -> float:
+    """To steps of even ``1 / radius`` up to `EVEN`, then of even roots; no radius of the identity, and no large one."""
+    if not 0.5 < radius < ROUNDED_TO:
         return radius
-    if radius >= EVEN:
-        return round(radius * STEPS) / STEPS
-    return 1 / (round(STEPS * EVEN**2 / radius) / (STEPS * EVEN**2))
+    if radius < EVEN:
+        return 1 / (2 - round(STEPS * (2 - 1 / radius)) / STEPS)
+    last = STEPS * (2 - 1 / EVEN)
+    number = round(last + STEPS * 2 / EVEN**1.5 * (math.sqrt(radius) - math.sqrt(EVEN)))
+    return (math.sqrt(EVEN) + (number - last) / STEPS * EVEN**1.5 / 2) ** 2
 
 
 def slow_cells(values: np.ndarray, coc: np.ndarray, weights: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -260,7 +261,7 @@ def slow_cells(values: np.ndarray, coc: np.ndarray, weights: np.ndarray) -> list
                 mean = reach / weight / 2**level if weight > 0 else 0.0
                 if level > 0:
                     mean = math.sqrt(max(mean**2 - SPREAD, 0.25))  # what interpolation will add
-                mean = round_radius(mean, level)
+                mean = round_radius(mean)
                 radius[row, column] = -mean if signed < 0 else mean
         levels.append((total, radius))
     return levels
@@ -301,7 +302,7 @@ def test_a_cell_has_the_radius_of_its_pixels_in_cells() -> None:
     for level, radius in ((1, 10.0), (2, -20.0), (3, 40.0)):
         shares = [torch.full_like(values, float(k == level)) for k in range(4)]
         _, got = merge_cells(values, torch.full_like(values, radius), shares)[level]
-        want = math.copysign(round_radius(math.sqrt((radius / 2**level) ** 2 - SPREAD), level), radius)
+        want = math.copysign(round_radius(math.sqrt((radius / 2**level) ** 2 - SPREAD)), radius)
         torch.testing.assert_close(got, torch.full_like(got, want), rtol=1e-14, atol=0)
 
 
@@ -311,7 +312,7 @@ def test_the_sign_of_a_cell_is_the_one_that_prevails() -> None:
     coc[..., 2:, :2] = torch.tensor([[9.0, 10.0], [-10.0, -9.5]])
     _, radius = merge_cells(torch.ones_like(coc), coc, shares_of(coc, Merging(4, 1e6), 1).unbind())[1]
     assert radius.sign()[0, 0].tolist() == [[-1, 1], [-1, 1]]
-    assert radius.abs()[0, 0, 0, 1].item() == pytest.approx(round_radius(math.sqrt(25 - SPREAD), 1), rel=1e-14)
+    assert radius.abs()[0, 0, 0, 1].item() == pytest.approx(round_radius(math.sqrt(25 - SPREAD)), rel=1e-14)
     empty = merge_cells(torch.ones_like(coc), torch.zeros_like(coc), shares_of(torch.zeros_like(coc)).unbind())[2]
     assert torch.equal(empty[0], torch.zeros_like(empty[0]))
     assert torch.equal(empty[1], torch.full_like(empty[1], 0.5))
@@ -406,7 +407,7 @@ def test_every_level_is_splatted_once_with_its_margin_and_its_radii() -> None:
     assert sorted(s[:2] for s in seen) == sorted(((1, 2, *s), (1, 1, *s)) for s in sizes)
     for shape, _, largest in seen:
         level = sizes.index(shape[2:])
-        assert largest <= (PLAIN.cells * 2 * (1 + FADE) if level < 2 else 15) + 0.5 / STEPS
+        assert largest <= (PLAIN.cells * 2 * (1 + FADE) if level < 2 else 15) * (1 + 3e-4)
 
 
 def flat_picture_error(coc: Tensor, merging: Merging, shape: Aperture, weight: Tensor | None = None) -> float:
@@ -578,7 +579,7 @@ def test_the_error_falls_with_the_cells() -> None:
     ]
     assert all(finer < 0.7 * coarser for coarser, finer in pairwise(errors)), errors
     # With nothing to merge, what is left are the rounded radii.
-    assert relative_l1(splat_merged(values, coc, Disc().profile(), Merging(64, 0.01)), want) < 1 / STEPS / 20
+    assert relative_l1(splat_merged(values, coc, Disc().profile(), Merging(64, 0.01)), want) < 1e-4
 
 
 def test_highlights_look_as_they_do_without_merging() -> None:

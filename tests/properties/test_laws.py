@@ -13,13 +13,17 @@ from properties.law import Law, tried
 from properties.laws import LAWS
 from properties.scenes import LARGE, Scene, draw, scenes
 
+LIT = "a picture with lights near its border is surrounded with its ground, "
 BROKEN: dict[str, str] = {
     "turned": "rows of discs are not their columns: 7 % of the light of 0.6 px lies elsewhere, 1.3 % of 5 px",
     "transposed": "as turned",
-    "border": "the picture is divided by its coverage, which is half of it at the border: lights there are too bright",
-    "promise": "the errors of the qualities are those of the recipes: dots, lines, text and night lights have more",
-    "tolerance": "as promise",
-    "no jump": "a picture with shutter_depth jumps where the exposure is cut into one more part",
+    "mirrored": LIT + "which is not that of the mirrored picture",
+    "upside down": LIT + "which is not that of the picture upside down",
+    "linear": LIT + "which is not linear in the picture",
+    "channels alone": LIT + "as soon as one channel has such lights",
+    "one layer": LIT + "but layers are not",
+    "half": LIT + "which looks at it in half precision",
+    "untouched": LIT + "whose last bit depends on strides",
 }
 """Laws that do not hold yet, and why."""
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchbokeh.banks.samples import BankSettings, Source, splat_samples
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.merge import LEAST_CONTRAST
+from torchbokeh.ops.highlights import LEAST_CONTRAST, ordinary_brightness
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
@@ -21,7 +21,7 @@ MOST = 4096
 """Highlights that are drawn densely, at most: the brightest."""
 
 CLIPPED = 3
-"""How often the mean of a picture is taken anew, without what is far above the last one."""
+"""How often what is ordinary is found anew: none of many highlights shall hide another."""
 
 CONTRAST = 100.0
 """Pixels are spread apart from others whose dark parts they outshine by this.
@@ -44,7 +44,7 @@ def dense_highlights(
     Args:
         values: ``(B, C, H, W)``, and last the coverage.
         sources: what is left of them in each part of the exposure, and its labels.
-        ordinary: their `ordinary_brightness`.
+        ordinary: their `ordinary_light`.
         settings: the bank, and whether to interpolate between its samples.
 
     Returns:
@@ -133,14 +133,10 @@ def _discs(bright: Tensor, shift: Tensor, radius: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def ordinary_brightness(values: Tensor) -> Tensor:
-    """What each pixel would show ``(B, C, H, W)`` were it no highlight: none raises it, so that none hides another."""
-    brightness, coverage = values.abs(), values[:, -1:].abs()
+def ordinary_light(values: Tensor) -> Tensor:
+    """What each pixel would show ``(B, C, H, W)`` were it no highlight; the last channel of ``values`` is coverage."""
+    coverage = values[:, -1:].abs()
     alive = (values != 0).any(1, keepdim=True).to(values.dtype)
     mean = coverage.sum((2, 3), keepdim=True) / alive.sum((2, 3), keepdim=True).clamp_min(1)
     coverage = coverage.maximum(mean) * alive
-    total = coverage.sum((2, 3), keepdim=True).clamp_min(TINY)
-    found = brightness.sum((2, 3), keepdim=True) / total
-    for _ in range(CLIPPED):
-        found = brightness.minimum(LEAST_CONTRAST * found * coverage).sum((2, 3), keepdim=True) / total
-    return found * coverage
+    return ordinary_brightness(values / coverage.clamp_min(TINY), coverage, CLIPPED) * coverage

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
-from torchbokeh.banks.highlights import brightness_classes, dense_highlights, ordinary_brightness, support
+from torchbokeh.banks.highlights import brightness_classes, dense_highlights, ordinary_light, support
 from torchbokeh.banks.samples import BankSettings, Source, splat_samples, spreading
 from torchbokeh.ops.checks import check_image, not_finite
 from torchbokeh.ops.composite import TINY
@@ -142,7 +142,7 @@ def splat_bank(
     values = values if len(parts) == 1 else values / len(parts)
     sources = [bank.model.clipped(values, part, 1) if settings.clip else (values, part) for part in parts]
     mean = torch.stack([source for source, _ in sources]).mean(0) if settings.clip else values
-    out, values = dense_highlights(values, sources, ordinary_brightness(mean), settings)
+    out, values = dense_highlights(values, sources, ordinary_light(mean), settings)
 
     count, spread, level = bank.values.shape[1], partial(splat_parts, parts=parts, settings=settings), 0
     darkest, *brighter = brightness_classes(values, count)

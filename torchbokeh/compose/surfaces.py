@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from torchbokeh.compose.exposure import Exposure
 from torchbokeh.ops.composite import TINY, pull_push
+from torchbokeh.ops.highlights import LEAST_CONTRAST, ordinary_brightness
 from torchbokeh.plan.bins import FOREGROUND
 
 COARSE = 4
@@ -117,11 +118,29 @@ def fill_hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     return pull_push(*planes).reshape(image.shape), pull_push(coc, weight)
 
 
+def filled_around(image: Tensor, known: Tensor, *, together: bool = False) -> Tensor:
+    """A picture ``(B, C, H, W)``, filled where ``known (B, 1, H, W)`` is 0 from where it is 1, without highlights.
+
+    Args:
+        image: the picture; 0 where it is not known.
+        known: where it is.
+        together: fill all channels from the same pixels, so that colours fit their coverage.
+    """
+    share = block_means(known, COARSE)
+    blocks = block_means(image, COARSE) / share.clamp_min(TINY)
+    ordinary = _ordinary(blocks, share)
+    if together:
+        ordinary = ordinary.amin(1, keepdim=True).expand_as(blocks)
+    weight = torch.maximum(share * ordinary, 1e-9 * share)
+    planes = (t.flatten(0, 1)[:, None] for t in (blocks, weight))
+    around = enlarged(pull_push(*planes).reshape(blocks.shape), COARSE, image.shape[2:])
+    return torch.where(known > 0, image, around)
+
+
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:
-    """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, far above four times the channel's mean."""
-    brightness = image.abs()
-    usual = 4 * (brightness * known).sum((2, 3), keepdim=True) / known.sum((2, 3), keepdim=True).clamp_min(TINY)
-    ratio = (brightness / usual.clamp_min(TINY)).clamp(max=1e4)  # keeps the power and its slope finite
+    """Weight ``(B, C, H, W)``: 1 for ordinary values, 0 for highlights, of which none begins abruptly."""
+    least = LEAST_CONTRAST * ordinary_brightness(image, known)
+    ratio = (image.abs() / least.clamp_min(TINY)).clamp(max=1e4)  # keeps the power and its slope finite
     return 1 / (1 + ratio**4)
 
 

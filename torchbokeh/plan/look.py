@@ -10,7 +10,8 @@ from torch import Tensor
 from torchbokeh.ops.spans import working_dtype
 from torchbokeh.picture.motion import Motion
 from torchbokeh.picture.request import Request
-from torchbokeh.plan.quality import QUALITIES, merged_shares
+from torchbokeh.plan.lights import lights_at_border
+from torchbokeh.plan.quality import predict_errors
 from torchbokeh.psfs.combined import STILL
 
 
@@ -33,7 +34,7 @@ class Look:
         low: smallest signed CoC in px after ``max_coc``, of the picture or of each layer that holds anything.
         high: largest, likewise.
         clamped: share of the pixels whose radius ``max_coc`` cut.
-        shares: those of `torchbokeh.plan.quality.merged_shares`.
+        errors: those of `torchbokeh.plan.quality.predict_errors`, where there is a tolerance to keep to.
         layer_count: number of input layers; 0 for a plain image.
         layers: indices of those that hold anything.
         opaque: indices of those that cover everything: their coverage needs no looking at.
@@ -41,13 +42,14 @@ class Look:
         motion: longest displacement in px over the open shutter.
         pan: the displacement (dx, dy) that all pixels share; None where they do not.
         approach: largest change of a signed radius in px while the shutter is open.
+        lights: how bright lights near the border are, see `torchbokeh.plan.lights.lights_at_border`.
     """
 
     size: tuple[int, int]
     low: tuple[float, ...]
     high: tuple[float, ...]
     clamped: float
-    shares: tuple[float, ...]
+    errors: tuple[float, ...]
     layer_count: int = 0
     layers: tuple[int, ...] = ()
     opaque: tuple[int, ...] = ()
@@ -55,6 +57,7 @@ class Look:
     motion: float = 0.0
     pan: tuple[float, float] | None = None
     approach: float = 0.0
+    lights: float = 0.0
 
     @property
     def coc_range(self) -> tuple[float, float]:
@@ -74,7 +77,7 @@ class Look:
 
 @torch.no_grad()
 def look_at(request: Request, settings: PlanSettings) -> Look:
-    """Look at a picture, or at layers, with one small copy from the device, and at its motion with another."""
+    """Look at a picture, or at layers, with a small copy from the device for its maps, its motion and its lights."""
     image, coc = request.image, request.coc
     if image.numel() == 0:
         raise ValueError(f"image: expected at least one pixel to plan for, got shape {tuple(image.shape)}")
@@ -82,9 +85,11 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     if not request.layered:
         motion, pan, approach = _look_at_motion(image, request.motion)
         clamped = coc.new_zeros(()) if request.clamped is None else request.clamped.to(coc.dtype).mean()
-        found = [*coc.aminmax(), clamped, *merged_shares(coc, settings.quality, settings.tolerance)]
-        low, high, share, *shares = torch.stack(found).tolist()
-        return Look(size, (low,), (high,), share, tuple(shares), 0, (), (), background, motion, pan, approach)
+        expected = [] if settings.tolerance is None else predict_errors(image, coc)
+        found = [t.to(coc.dtype) for t in (*coc.aminmax(), clamped, *expected)]
+        low, high, share, *errors = torch.stack(found).tolist()
+        lights = lights_at_border(image, coc, max(-low, high), motion + approach)
+        return Look(size, (low,), (high,), share, tuple(errors), 0, (), (), background, motion, pan, approach, lights)
     there = image[:, :, 3:] > 0
     # A product: what is not finite is refused, wherever it is.
     motion, pan, approach = _look_at_motion(image, request.motion.mapped(lambda t: t * there))
@@ -92,15 +97,17 @@ def look_at(request: Request, settings: PlanSettings) -> Look:
     highs = torch.where(there, coc, -torch.inf).movedim(1, 0).flatten(1).amax(1)
     cut = request.clamped
     clamped = lows.new_zeros(()) if cut is None else (cut & there).sum() / there.sum().clamp_min(1)
-    merging = merged_shares(coc, settings.quality, settings.tolerance, there)
+    expected = [] if settings.tolerance is None else predict_errors(image, torch.where(there, coc, torch.nan))
     least = image[:, :, 3:].movedim(1, 0).flatten(1).amin(1).to(lows.dtype)
-    numbers = torch.cat([lows, highs, least, torch.stack([clamped.to(lows.dtype), *merging])]).tolist()
-    bounds, (share, *shares) = numbers[: -len(QUALITIES) - 1], numbers[-len(QUALITIES) - 1 :]
-    count = image.shape[1]
+    rest = torch.stack([t.to(lows.dtype) for t in (clamped, *expected)])
+    count, numbers = image.shape[1], torch.cat([lows, highs, least, rest]).tolist()
+    bounds, (share, *errors) = numbers[: 3 * count], numbers[3 * count :]
     kept = tuple(k for k in range(count) if bounds[k] <= bounds[count + k])
     opaque = tuple(k for k in range(count) if bounds[2 * count + k] >= 1)
     ends = tuple(bounds[k] for k in kept), tuple(bounds[count + k] for k in kept)
-    return Look(size, *ends, share, tuple(shares), count, kept, opaque, background, motion, pan, approach)
+    largest = max((*map(abs, ends[0]), *map(abs, ends[1])), default=0.0)
+    lights = lights_at_border(image, torch.where(there, coc, 0.0), largest, motion + approach)
+    return Look(size, *ends, share, tuple(errors), count, kept, opaque, background, motion, pan, approach, lights)
 
 
 def _look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, float] | None, float]:

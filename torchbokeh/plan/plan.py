@@ -1,6 +1,5 @@
 """What a scene needs, decided once: `LensBlur.plan` makes a `Plan`, and a forward pass carries it out."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -19,12 +18,6 @@ Hidden = Literal["nothing", "filled", "given", "layers"]
 
 Route = Literal["sharp", "uniform", "layers", "foreground", "surface"]
 
-STEP = 2.0
-"""Change of a radius in px over one part of the exposure."""
-
-MOST_PARTS = 12
-"""Parts of the exposure, at most: of larger radii a larger step is not seen."""
-
 _HIDDEN = {
     "filled": "what it hides is filled from its surroundings (pass background= if you know it)",
     "given": "what it hides comes from background=",
@@ -40,10 +33,13 @@ class Plan(Look):
         hidden: how what the foreground hides is known.
         bins: for every surface, front to back, the centres of its soft bins in px of CoC.
         subapertures: the lens is cut into the square of this many pieces.
+        parts: the exposure is cut into this many parts of constant radius.
+        surrounded: the picture is surrounded with its ground, this many px on each side, for the lights at its border.
         aperture: the shape of the aperture, for the reader.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error of the splats against exact ones, see `Quality`.
+        predicted_error: largest relative L1 error of the splats against exact ones: of any picture, see `Quality`,
+            or of this one where there is a tolerance, see `torchbokeh.plan.quality.predict_errors`.
         colours: the lights that a lens with dispersion takes a picture in, one by one; none where that is not seen.
         spread: how far it spreads them in px, in radius and place.
         fading: plans with a part less, and how much their pictures count for in a mean with that of this plan: where a
@@ -54,6 +50,8 @@ class Plan(Look):
     hidden: Hidden
     bins: tuple[tuple[float, ...], ...]
     subapertures: int
+    parts: int
+    surrounded: int
     aperture: str
     quality: Quality
     highest: int
@@ -61,11 +59,6 @@ class Plan(Look):
     colours: tuple["Colour", ...] = ()
     spread: float = 0.0
     fading: tuple[tuple["Plan", float], ...] = ()
-
-    @property
-    def parts(self) -> int:
-        """Into how many parts of constant radius the exposure is cut."""
-        return min(max(math.ceil(self.approach / STEP), 2), MOST_PARTS) if self.approaches else 1
 
     @property
     def uniform(self) -> float | None:
@@ -149,6 +142,8 @@ class Plan(Look):
             head += f"\nDispersion spreads colours by up to {self.spread:.1f} px: {how} are blurred one by one."
         if self.sharp and not self.colours:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.surrounded:
+            head += f"\n{lights_text(self.surrounded)}"
         if self.uniform is not None:
             moved = f", moved by ({self.pan[0]:.1f}, {self.pan[1]:.1f}) px" if self.moves and self.pan else ""
             return f"{head}\nEvery pixel has the same PSF ({self.aperture}{moved}): a single convolution."
@@ -173,7 +168,7 @@ class Plan(Look):
         if self.highest:
             lines.append(
                 f"Quality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
-                f"merged by radius; predicted relative error of the splats {self.predicted_error:.2g}."
+                f"merged by radius; relative error of the splats at most {self.predicted_error:.2g}."
             )
         elif self.quality.merging is not None:
             lines.append(f"Quality {self.quality.name!r}: the blur is too small for pixels to be merged.")
@@ -183,6 +178,11 @@ class Plan(Look):
         if self.clamped:
             lines.append(f"max_coc cuts the blur of {100 * self.clamped:.2g} % of the pixels.")
         return "\n".join(lines)
+
+
+def lights_text(surrounded: int) -> str:
+    """What is assumed of the surroundings, for the reader of a plan."""
+    return f"Lights near the border: {surrounded} px around the picture go on as its ground does, without lights."
 
 
 class Colour(NamedTuple):
@@ -222,9 +222,10 @@ class SplattingPlan:
         largest: the largest radius in px.
         quality: the operating point.
         highest: the coarsest level that pixels are merged on; 0 if none are.
-        predicted_error: relative L1 error against the exact splat, see `Quality`.
+        predicted_error: largest relative L1 error against the exact splat, as in `Plan`.
         sharp: every radius is below half a pixel: the image passes through.
         uniform: the signed radius in px that all pixels share, where one convolution does it; else None.
+        surrounded: as in `Plan`; and ``lit``, how much the picture with surroundings counts for.
     """
 
     size: tuple[int, int]
@@ -234,6 +235,8 @@ class SplattingPlan:
     predicted_error: float
     sharp: bool
     uniform: float | None = None
+    surrounded: int = 0
+    lit: float = 0.0
 
     @property
     def detail(self) -> Detail:
@@ -255,11 +258,13 @@ class SplattingPlan:
         head = f"{width} x {height} image, radius up to {self.largest:.1f} px."
         if self.sharp:
             return f"{head}\nEverything is within half a pixel of sharp: the image passes through unchanged."
+        if self.lit:
+            head += f"\n{lights_text(self.surrounded)}"
         if self.uniform is not None:
             return f"{head}\nEvery pixel has the same PSF: a single convolution."
         if self.highest == 0:
             return f"{head}\nQuality {self.quality.name!r}: every pixel is splatted by itself."
         return (
             f"{head}\nQuality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
-            f"merged; predicted relative error {self.predicted_error:.2g}."
+            f"merged; relative error at most {self.predicted_error:.2g}."
         )

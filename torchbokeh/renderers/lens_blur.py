@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from torchbokeh.compose.colours import Mixture, in_light
 from torchbokeh.compose.routes import ROUTES, Pieces
+from torchbokeh.compose.surroundings import Surrounding
 from torchbokeh.lens.base import Lens
 from torchbokeh.ops.checks import check_choice, check_whole, is_number, is_whole
 from torchbokeh.ops.spans import subdivide
@@ -239,7 +240,8 @@ class LensBlur(nn.Module):
                 if picture.colour is not colour:
                     colour = picture.colour
                     one = whole if colour is None else in_light(whole, colour)
-                part = ROUTES[picture.plan.route](one, picture.plan, pieces)
+                around = Surrounding(picture.plan.surrounded)
+                part = around.cut(ROUTES[picture.plan.route](around.of(one), picture.plan, pieces))
                 mixture.add(part, colour, picture.share, layered=request.layered)
             return mixture.total()
 

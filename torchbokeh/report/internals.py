@@ -7,7 +7,7 @@ What is renamed or moved inside the package is renamed here. ``torchbokeh.ops`` 
 from torchbokeh.banks import highlights as bank_highlights
 from torchbokeh.banks import samples as bank_samples
 from torchbokeh.banks import splat as bank_splatting
-from torchbokeh.banks.highlights import BRIGHT, ordinary_brightness, share_of_others
+from torchbokeh.banks.highlights import BRIGHT, ordinary_light, share_of_others
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
 from torchbokeh.compose.composition import CERTAIN
 from torchbokeh.compose.surfaces import COARSE

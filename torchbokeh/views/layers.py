@@ -1,14 +1,21 @@
 """Many views of layers: each is warped by the parallax of its own pixels."""
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.compose.surfaces import continued
+from torchbokeh.compose.surroundings import Surrounding
 from torchbokeh.lens.field_map import Field
 from torchbokeh.ops.planes import pixel_centres
 from torchbokeh.ops.raycast import subsample_blur
-from torchbokeh.picture.sensor import STEPS
+from torchbokeh.picture.motion import Motion
+from torchbokeh.picture.request import Request
+from torchbokeh.picture.sensor import STEPS, Sensor
+from torchbokeh.plan.decide import passed
+from torchbokeh.plan.lights import BRIGHTER, lights_at_border
 from torchbokeh.views.points import Views
 from torchbokeh.views.prism import Prism
 from torchbokeh.views.setup import Bounds, ViewSettings, scheduled
@@ -78,11 +85,33 @@ def accumulate_layers(
     b, _, _, h, w = layers.shape
     if layers.numel() == 0:
         return layers.new_zeros(b, 4, h, w)
-    if b > 1 and (settings.level_of_detail or settings.reuse):
-        # What an item may share or leave out does not depend on the others.
+    if b > 1:
+        # What an item may share, leave out or be surrounded with does not depend on the others.
         moved = [None] * b if motion is None else motion.split(1)
         each = zip(layers.split(1), coc.split(1), moved, strict=True)
         return torch.cat([accumulate_layers(*one, views, prism, settings) for one in each])
+    largest = float(torch.where(layers[:, :, 3:] > 0, coc, 0.0).detach().abs().max())
+    farthest = 0.0 if motion is None else float(motion.detach().norm(dim=2).max())
+    lit = passed(lights_at_border(layers.detach(), coc.detach(), largest, farthest), BRIGHTER)
+    if not lit:
+        return _accumulated(layers, coc, motion, views, prism, settings)
+    around = Surrounding(min(math.ceil(largest + farthest), min(h, w) // 2))
+    request = around.of(Request(layers, coc, Motion(() if motion is None else (motion,)), None, Sensor((h, w))))
+    maps = request.image, request.coc, motion if motion is None else request.motion.displacements[0]
+    whole = around.cut(_accumulated(*maps, views, prism, settings, around.width))
+    return whole if lit == 1 else torch.lerp(_accumulated(layers, coc, motion, views, prism, settings), whole, lit)
+
+
+def _accumulated(
+    layers: Tensor,
+    coc: Tensor,
+    motion: Tensor | None,
+    views: Views,
+    prism: Prism | None,
+    settings: ViewSettings,
+    margin: int = 0,
+) -> Tensor:
+    h, w = layers.shape[3:]
     # The pixels of the input are means already: shifting them would only blur them once more.
     views = Views(views.lens, views.time, torch.zeros_like(views.shift))
     kept, limits = _bounds(layers, coc, motion)
@@ -95,7 +124,7 @@ def accumulate_layers(
     last = {(i, p): v for v, row in enumerate(parents.tolist()) for i, p in enumerate(row)}
     copies: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
     total = torch.zeros_like(layers[:, 0])
-    field = Field.pixels((h, w), 0, coc)
+    field = Field.pixels((h, w), margin, coc)
     for v in range(len(views)):
         left = torch.ones_like(total[:, 3:])
         picture, front, most_seen = torch.zeros_like(total), torch.zeros_like(left), torch.zeros_like(left)

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchbokeh.ops.kernels import merge_gather
 from torchbokeh.ops.kernels.merge import bank_for
 from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, collect
-from torchbokeh.ops.merge import MARGIN, SPREAD, STEPS, Merging, level_shares, merge_cells, splat_merged, upsample
+from torchbokeh.ops.merge import MARGIN, SPREAD, Merging, level_shares, merge_cells, splat_merged, upsample
 from torchbokeh.ops.system.threads import recorded, run_all, stage
 from torchbokeh.psfs import Aperture, Disc, Polygon
 
@@ -30,7 +30,7 @@ def scene(b: int, c: int, h: int, w: int, reach: float = 60.0, seed: int = 1) ->
     sign = torch.randint(0, 2, radius.shape, generator=draw) * 2 - 1
     radius = torch.where(torch.rand(radius.shape, generator=draw) < 0.05, 0.0, radius)
     # Where a PSF just touches a row, at 1.5, 2.5, ... px, its derivative jumps, and either side is right.
-    radius = torch.where((radius % 1 - 0.5).abs() < 1 / STEPS, radius + 2 / STEPS, radius)
+    radius = torch.where((radius % 1 - 0.5).abs() < 1 / 64, radius + 1 / 32, radius)
     return torch.where(bright, 200 * values, values), radius * sign
 
 
@@ -64,8 +64,8 @@ def assert_same_function(
 ) -> None:
     """The kernel in float32 against the torch definition in float64: picture and gradients.
 
-    A mean radius close to half a step may be rounded one way in float32 and the other way in float64. The scenes here
-    have no such cell: it would change a few values by 1e-3.
+    A mean radius close to half a step may be rounded one way in float32 and the other way in float64. One cell in some
+    thousand is such a one, which moves its light by a step: so one value in a hundred may be off by 1e-4.
     """
     got, want = (
         results(values.to(t), coc.to(t), *args, weight=None if weight is None else weight.to(t), **kinds)
@@ -76,7 +76,9 @@ def assert_same_function(
             mine, theirs = (t * (weight > 0) for t in (mine, theirs))
         assert (mine.dtype, theirs.dtype) == (F32, F64)
         assert mine.isfinite().all()
-        assert_close(mine, theirs, relative)
+        off = (mine.double() - theirs).abs() / theirs.abs().max().clamp_min(1e-300)
+        assert off.max() <= max(1e-4, relative)
+        assert (off > relative).sum() <= 0.01 * off.numel()
 
 
 # The same function as the torch definition.
@@ -375,8 +377,8 @@ def test_cells_are_those_of_the_definition(size: tuple[int, int], channels: int,
             with np.errstate(invalid="ignore"):
                 mean = np.nan_to_num(records[..., 5] / records[..., 4]) / 2**level
             smaller = np.sqrt(np.maximum(mean**2 - SPREAD, 0.25)) * np.where(records[..., 6] < 0, -1, 1)
-            # Cells are rounded to a step, and then to one of those of the bank, which are no wider.
-            np.testing.assert_allclose(smaller, radius[0, 0], rtol=0, atol=1.02 / STEPS)
+            # Half a step, which is widest for large cells.
+            np.testing.assert_allclose(smaller, radius[0, 0], rtol=5e-4, atol=1e-6)
     assert levels.cells.dtype == np.float32
 
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchbokeh.ops.kernels.radius_bank import RadiusBank, number_of, radius_bank, radius_of
 from torchbokeh.ops.kernels.splat import shape_of
-from torchbokeh.ops.merge import EVEN, STEPS, rounded
+from torchbokeh.ops.merge import EVEN, ROUNDED_TO, STEPS, rounded
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.ops.splat import splat_spans
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
@@ -40,13 +40,16 @@ def radii_of(numbers: list[int]) -> Tensor:
 
 
 def test_numbers_are_those_of_the_rounded_radii() -> None:
-    radius = torch.cat([torch.linspace(0.5, 20, 4001, dtype=F64), torch.tensor([EVEN, 1e4 + 1 / 3], dtype=F64)])
+    radius = torch.cat([torch.linspace(0.5, 20, 4001, dtype=F64), torch.tensor([EVEN, 31 + 1 / 3], dtype=F64)])
     got = torch.tensor([radius_of(number_of(float(r))) for r in radius], dtype=F64)
     torch.testing.assert_close(got, rounded(radius), rtol=1e-13, atol=0)
     torch.testing.assert_close(rounded(got), got, rtol=1e-13, atol=0)
-    step = (radius / EVEN).square().clamp_max(1) / STEPS
+    step = torch.minimum(radius.square(), EVEN**1.5 * radius.sqrt()) / STEPS
     assert ((got - radius).abs() < 0.51 * step).all()
+    assert (4 * (got - radius).abs() <= 1.01e-3 * radius).all()
     assert number_of(0.0) == number_of(MIN_RADIUS) == 0
+    kept = torch.tensor([0.0, 0.3, MIN_RADIUS, ROUNDED_TO, 1e4 + 1 / 3], dtype=F64)
+    assert torch.equal(rounded(kept), kept)
 
 
 def test_weights_change_little_from_one_psf_to_the_next(shape: Aperture) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 import torchbokeh as tb
 from torchbokeh.ops.merge import splat_merged
 from torchbokeh.ops.splat import splat_spans
-from torchbokeh.plan.quality import QUALITIES, ROUNDING, check_quality, choose, merged_shares
+from torchbokeh.plan.quality import QUALITIES, ROUNDING, check_quality, choose, predict_errors
 
 MERGED = [q for q in QUALITIES if q.merging is not None]
 
@@ -50,24 +50,64 @@ def test_errors_on_the_recipes_are_those_stated(name: str, radius: float) -> Non
 
 
 def test_a_tolerance_takes_the_fastest_point_that_keeps_to_it() -> None:
-    everything = [0.0, 1.0, 1.0, 1.0]
+    errors = [0.0, 0.004, 0.01, 0.03]
+    for quality, error in zip(QUALITIES, errors, strict=True):
+        assert choose("exact", error, errors, 50.0) == (quality, error)
+    assert choose("fast", 0.003, errors, 50.0)[0].name == "exact"
+    assert choose("exact", 1.0, errors, 50.0)[0].name == "fast"
+
+
+def test_a_name_takes_that_point_and_its_largest_error() -> None:
     for quality in QUALITIES:
-        assert choose("exact", quality.error, everything) == (quality, quality.error)
-    assert choose("fast", 0.0, everything)[0].name == "exact"
-    assert choose("exact", 1.0, everything)[0].name == "fast"
-    # Where little is wide enough to be merged, little is wrong.
-    assert choose("exact", 0.001, [0.0, 0.01, 0.02, 0.03])[0].name == "fast"
-    assert choose("exact", ROUNDING, [0.0, 0.0, 0.0, 0.0])[0].name == "fast"
-    assert choose("exact", 0.9 * ROUNDING, [0.0, 0.0, 0.0, 0.0])[0].name == "exact"
-    assert choose("balanced", None, everything)[0].name == "balanced"
+        assert choose(quality.name, None, [], 50.0) == (quality, quality.error)
+    assert choose("balanced", None, [], 7.9)[1] == ROUNDING
+    assert choose("exact", None, [], 7.9)[1] == 0
 
 
-def test_shares_count_what_is_merged() -> None:
-    coc = torch.tensor([0.0, -4.9, 5.0, 7.9, -8.0, 15.9, 16.0, -100.0]).view(1, 1, 2, 4)
-    assert [round(s.item() * 8) for s in merged_shares(coc, "exact", 0.1)] == [0, 2, 4, 6]
-    twice, there = torch.cat([coc, coc]), torch.cat([coc * 0 + 1, coc * 0]) > 0
-    assert merged_shares(twice, "exact", 0.1, there) == merged_shares(coc, "exact", 0.1)
-    assert [round(s.item() * 8) for s in merged_shares(coc, "balanced", None)] == [0, 0, 4, 0]
+def test_even_light_and_smooth_radii_are_predicted_to_err_least() -> None:
+    even, ramp = torch.ones(1, 3, 96, 96), torch.linspace(20, 40, 96).expand(1, 1, 96, 96)
+    for quality, error in zip(QUALITIES, predict_errors(even, ramp), strict=True):
+        assert error.item() == pytest.approx(quality.even + (ROUNDING if quality.merging else 0))
+    light = torch.zeros(1, 3, 96, 96)
+    light[..., 40, 50] = 1.0
+    radii = torch.rand(1, 1, 96, 96, generator=torch.Generator().manual_seed(0)) * 40
+    for image, coc in ((light, ramp), (even, 10 + radii)):
+        for quality, error in zip(QUALITIES, predict_errors(image, coc), strict=True):
+            assert quality.error * 0.95 <= error.item() <= quality.error + ROUNDING + 1e-6
+
+
+def test_where_nothing_is_wide_only_radii_are_rounded() -> None:
+    image, coc = torch.rand(1, 3, 40, 40), torch.rand(1, 1, 40, 40) * 4
+    assert [e.item() for e in predict_errors(image, coc)] == pytest.approx([0, ROUNDING, ROUNDING, ROUNDING])
+
+
+def test_a_batch_is_expected_to_err_like_its_worst_picture() -> None:
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(3, 3, 70, 50, generator=generator) ** torch.tensor([0.1, 8.0, 1.0]).view(3, 1, 1, 1)
+    coc = torch.rand(3, 1, 1, 1, generator=generator) * 60 + torch.zeros(3, 1, 70, 50)
+    alone = torch.stack([torch.stack(predict_errors(i[None], c[None])) for i, c in zip(image, coc, strict=True)])
+    torch.testing.assert_close(torch.stack(predict_errors(image, coc)), alone.amax(0))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_predictions_do_not_depend_on_the_unit_of_light(scale: float) -> None:
+    image, coc = torch.rand(1, 3, 70, 50, dtype=torch.float64), torch.rand(1, 1, 70, 50, dtype=torch.float64) * 30
+    for one, other in zip(predict_errors(image, coc), predict_errors(image * scale, coc), strict=True):
+        assert one.item() == pytest.approx(other.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("tolerance", [0.005, 0.02])
+@pytest.mark.parametrize("period", [5, 12, 15])
+@pytest.mark.parametrize("radius", [20.0, 35.4, 45.0])
+def test_a_tolerance_holds_for_dots_and_lines(tolerance: float, period: int, radius: float) -> None:
+    """Lines of a few pixels beat with the cells that they are merged into, dots with the coverage around them."""
+    y, x = torch.meshgrid(torch.arange(140), torch.arange(200), indexing="ij")
+    lines, dots = x % period == 0, (x % period == 0) & (y % period == 0)
+    image = torch.stack([lines, dots, lines | dots])[None].float()
+    for coc in (torch.full((1, 1, 140, 200), radius), (radius * (x // 31 % 3) / 2)[None, None]):
+        want = tb.KernelSplatting(quality="exact")(image, coc)
+        got = tb.KernelSplatting(tolerance=tolerance)(image, coc)
+        assert (got - want).abs().sum() <= tolerance * want.sum()
 
 
 @pytest.mark.parametrize(

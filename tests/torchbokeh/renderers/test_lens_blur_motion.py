@@ -330,6 +330,27 @@ def test_gradients_reach_the_depth_at_the_ends() -> None:
     torch.testing.assert_close((slope * step).sum(), change, rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("quality", ["exact", "balanced"])
+def test_an_approach_is_cut_into_more_parts_gradually(quality: str) -> None:
+    """From two parts to as many as there are: a small step of the closing radius changes the picture by little."""
+    blur, image, coc = (
+        LensBlur(quality=quality),
+        torch.rand(1, 3, 24, 24, generator=draw(0)),
+        torch.full((1, 1, 24, 24), -0.4),
+    )
+
+    def after(approach: float) -> Tensor:
+        return blur(image, coc=coc, shutter_depth=torch.cat([coc + 3.0, coc + 3.0 - approach], 1))
+
+    counts = set()
+    for approach in (3.5, 4.0, 5.75, 6.0, 21.9, 22.0, 24.0, 25.0):
+        near = [after(approach + d) for d in (-1e-4, 0.0, 1e-4)]
+        assert max(float((b - a).abs().max()) for a, b in pairwise(near)) < 1e-3
+        ends = torch.cat([coc + 3.0, coc + 3.0 - approach], 1)
+        counts.add(blur.plan(image, coc=coc, shutter_depth=ends).parts)
+    assert counts == {2, 3, 4, 12}
+
+
 def test_the_plan_says_that_radii_change() -> None:
     blur = LensBlur()
     plan = blur.plan(picture(), coc=halves(4, 4), shutter_depth=ends(2.0, 9.0))

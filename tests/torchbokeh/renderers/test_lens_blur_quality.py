@@ -98,9 +98,9 @@ def test_the_plan_names_the_quality() -> None:
         assert (plan.highest > 0) == (quality.merging is not None and 2 * quality.merging.cells <= 35)
         assert plan.predicted_error <= quality.error
         assert (f"Quality {quality.name!r}" in str(plan)) == (quality.merging is not None)
-    picked = tb.LensBlur(tolerance=0.02).plan(image, coc=coc)
+    picked = tb.LensBlur(tolerance=0.05).plan(image, coc=coc)
     assert picked.quality.name in ("balanced", "fast")
-    assert picked.predicted_error <= 0.02
+    assert picked.predicted_error <= 0.05
 
 
 def test_a_plan_carries_the_quality() -> None:

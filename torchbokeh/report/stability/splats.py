@@ -13,15 +13,15 @@ from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.dense import dense_spans
+from torchbokeh.ops.highlights import LEAST_CONTRAST
 from torchbokeh.ops.integrate import lattice_green
-from torchbokeh.ops.merge import LEAST_CONTRAST
 from torchbokeh.ops.spans import MIN_RADIUS
 from torchbokeh.psfs.aperture import Disc
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.combined import Combined
 from torchbokeh.psfs.model import Labels, Place
 from torchbokeh.psfs.represent import DOMAINS
-from torchbokeh.report.internals import BRIGHT, ordinary_brightness, share_of_others
+from torchbokeh.report.internals import BRIGHT, ordinary_light, share_of_others
 
 FINE = 2
 """Samples along each side of a pixel that the capsule of a highlight is drawn by (`torchbokeh.ops.capsules`)."""
@@ -47,7 +47,7 @@ def dense_bank(values: Tensor, parts: Sequence[Labels], bank: PsfBank) -> Tensor
     values = values / len(parts)
     seen = [bank.model.clipped(values, part, 1) if extreme else (values, part) for part in parts]
     light = torch.stack([t for t, _ in seen]).mean(0)
-    ordinary = ordinary_brightness(light)
+    ordinary = ordinary_light(light)
     bound = ordinary * (BRIGHT * bank.model.area([part for _, part in seen], bank.reach())).clamp_min(LEAST_CONTRAST)
     bright = (light.abs() > bound.clamp_min(TINY)).any(1, keepdim=True)
     kept = share_of_others(light, ordinary, bright, bank.values.shape[1])
