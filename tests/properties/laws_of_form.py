@@ -189,7 +189,7 @@ LAWS = (
         "One opaque layer is the image of it, through the whole lens; relative L1.",
         one_surface,
         one_layer,
-        lambda s: at_quality(s, 1e-5, 1e-2, 1e-3),
+        lambda s: at_quality(s, 1e-5, 1e-2, 1e-1),
     ),
     Law("background", "A background is not seen where nothing hides it: same bits.", behind_all, with_background, 0.0),
     Law(

@@ -121,27 +121,20 @@ def fill_hidden(image: Tensor, coc: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     return pull_push(*planes).reshape(image.shape), pull_push(coc, weight)
 
 
-def with_ground_around(image: Tensor, width: int, *, together: bool = False) -> Tensor:
+def with_ground_around(image: Tensor, width: int, colours: int) -> Tensor:
     """A picture ``(B, C, H, W)`` and ``width`` px on each side, in which its border goes on without its highlights.
 
     Args:
         image: the picture.
         width: px.
-        together: the last channel is a coverage: what is left out of a colour is left out of all.
+        colours: how many channels are colours. What is a highlight in one is left out of all, and of coverage.
     """
     least = LEAST_CONTRAST * ordinary_brightness(image, torch.ones_like(image[:, :1]), CLIPPED)
     ordinary = (2 - image.abs() / least.clamp_min(torch.finfo(image.dtype).tiny)).clamp(1e-9, 1)
-    if together:
-        ordinary = ordinary[:, :-1].amin(1, keepdim=True).expand_as(image)
-    share = block_means(ordinary, COARSE)
-    planes = (t.flatten(0, 1)[:, None] for t in (block_means(ordinary * image, COARSE) / share, share.clamp(max=1)))
-    ground = pull_push(*planes).reshape(share.shape)
-    blocks = -(-width // COARSE)
-    ground, start = F.pad(ground, (blocks,) * 4, mode="replicate"), blocks * COARSE - width
-    height, along = (n + 2 * width for n in image.shape[2:])
-    around = enlarged(ground, COARSE, (start + height, start + along))[..., start:, start:]
+    # A pixel alone counts for little, blocks of so many for what they are: what goes on is smooth.
+    ground = pull_push(image, ordinary[:, :colours].amin(1, keepdim=True) / COARSE**2)
     inside = F.pad(torch.ones_like(image[:1, :1], dtype=torch.bool), (width,) * 4)
-    return torch.where(inside, F.pad(image, (width,) * 4), around)
+    return torch.where(inside, F.pad(image, (width,) * 4), F.pad(ground, (width,) * 4, mode="replicate"))
 
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:

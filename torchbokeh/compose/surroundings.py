@@ -31,13 +31,16 @@ class Surrounding(NamedTuple):
             def map_of(t: Tensor) -> Tensor:
                 return self._edges(continued(t.flatten(0, 1), alpha, COARSE)).unflatten(0, t.shape[:2])
 
-            colours = with_ground_around(image.flatten(0, 1), self.width, together=True).unflatten(0, image.shape[:2])
+            colours = with_ground_around(image.flatten(0, 1), self.width, 3).unflatten(0, image.shape[:2])
             return request._replace(image=colours, coc=map_of(coc), motion=motion.mapped(map_of))
         if behind is not None:
-            behind = with_ground_around(behind[0], self.width), None if behind[1] is None else self._edges(behind[1])
+            behind = (
+                with_ground_around(behind[0], self.width, image.shape[1]),
+                None if behind[1] is None else self._edges(behind[1]),
+            )
         labels = request.labels
         return request._replace(
-            image=with_ground_around(image, self.width),
+            image=with_ground_around(image, self.width, image.shape[1]),
             coc=self._edges(coc),
             motion=motion.mapped(self._edges),
             background=behind,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
+from torchbokeh.ops.dispatch import compute_dtype
 from torchbokeh.ops.highlights import LEAST_CONTRAST
 from torchbokeh.ops.spans import MIN_RADIUS
 
@@ -30,7 +31,7 @@ def lights_at_border(image: Tensor, coc: Tensor, largest: float, moved: float = 
     """
     if largest + moved <= MIN_RADIUS:
         return 0.0
-    light = image.flatten(0, -4).abs()
+    light = image.flatten(0, -4).to(compute_dtype(image)).contiguous().abs()  # sums do not depend on strides
     light, weight = (light[:, :3], light[:, 3:]) if image.dim() == 5 else (light, torch.ones_like(light[:, :1, :1, :1]))
     ordinary = light.mean((2, 3), keepdim=True) / weight.mean((2, 3), keepdim=True).clamp_min(TINY)
     contrast = (light / ordinary.clamp_min(torch.finfo(light.dtype).tiny)).amax(1)
