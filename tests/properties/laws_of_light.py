@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .law import PROMISED, Law, anything, at_quality, light_error, peak_error, promised
+from .law import PROMISED, Law, anything, at_quality, light_error, peak_error, promised, without_lights
 from .renderers import picture, plan, planned
 from .scenes import Inputs, Scene
 
@@ -152,10 +152,10 @@ def linear(scene: Scene) -> float:
 
 
 def where_linear(scene: Scene) -> Scene:
-    """What is filled in leaves highlights out, which is not linear, and so are those of banks."""
+    """What is filled in, and goes on beyond the border, leaves highlights out, which is not linear; so do banks."""
     if scene.layers == 0 and scene.background == "none":
         scene = replace(scene, side="behind")
-    return replace(scene, image="noise" if scene.image in ("range", "spikes", "lognormal") else scene.image)
+    return without_lights(scene)
 
 
 def channels_alone(scene: Scene) -> float:
@@ -169,9 +169,9 @@ def channels_alone(scene: Scene) -> float:
 
 
 def of_channels(scene: Scene) -> Scene | None:
-    if scene.lens in ("rgb", "continuous") or scene.bank in COLOURED:
+    if scene.lens in ("rgb", "continuous") or scene.bank in COLOURED or not planned(scene):
         return None
-    return None if scene.renderer not in ("LensBlur", "KernelSplatting") else replace(promised(scene), layers=0)
+    return replace(promised(without_lights(scene)), layers=0)
 
 
 def merging(scene: Scene) -> float:

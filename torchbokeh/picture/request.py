@@ -137,7 +137,7 @@ class Request(NamedTuple):
             image=self.image.to(dtype).contiguous(),
             coc=self.coc.to(dtype).contiguous(),
             motion=self.motion.mapped(lambda t: t.to(dtype)),
-            background=None if behind is None else (behind[0].to(dtype), of(behind[1])),
+            background=None if behind is None else (behind[0].to(dtype).contiguous(), of(behind[1])),
             labels=None if labels is None else Labels(*map(of, labels)),
         )
 
