@@ -97,7 +97,8 @@ def promised(scene: Scene) -> Scene:
 
 def without_lights(scene: Scene) -> Scene:
     """Nothing that stands out so far that it is rendered in another way than the rest."""
-    return scene if scene.image in ("noise", "uniform", "black") else replace(scene, image="noise")
+    size = tuple(max(n, 12) for n in scene.size)  # of a few pixels one may be as bright as all others together
+    return replace(scene, size=size, image=scene.image if scene.image in ("noise", "uniform", "black") else "noise")
 
 
 def anything(scene: Scene) -> Scene:
