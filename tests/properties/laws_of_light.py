@@ -133,7 +133,7 @@ def homogeneous(scene: Scene) -> float:
 def linear(scene: Scene) -> float:
     """One picture and another, blurred and added, against their sum blurred."""
     first = scene.inputs()
-    second = replace(scene, image="noise", seed=scene.seed + 1).inputs()
+    second = replace(scene, image="noise", alpha="opaque", seed=scene.seed + 1).inputs()
     both = first.image + second.image
     mine, yours = first, first._replace(image=second.image)
     if scene.layers:
