@@ -51,6 +51,10 @@ def blurred(surface: Surface, profile: Profile, detail: Detail) -> tuple[Tensor,
     source = torch.cat([surface.colour, torch.ones_like(coc) if alpha is None else alpha], 1)
     splats = [splat(source * weight) for weight in bin_weights(coc, surface.centres)]
     colour, coverage = fill_until_full([(bin[:, :-1], bin[:, -1:]) for bin in splats])
+    if exposure is not None:
+        # Where a huge blur leaves hardly anything, sparse PSFs leave rounding alone, and the mean is not one any more.
+        plain = torch.where(source[:, -1:] > 0, source[:, :-1] / source[:, -1:].clamp_min(TINY), 0.0)
+        colour = colour.clamp(plain.amin((2, 3), True), plain.amax((2, 3), True))
     if alpha is None:
         return colour, torch.ones_like(coverage), coverage
     # The same splats of a surface without holes say which part of the coverage is due to their density.

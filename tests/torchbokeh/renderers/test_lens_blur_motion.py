@@ -373,3 +373,18 @@ def test_long_motion_in_half_precision(dtype: torch.dtype) -> None:
     motion = torch.full((1, 2, 8, 9), 1024.0, dtype=dtype)
     assert LensBlur().plan(image, coc=coc, motion=motion).motion == pytest.approx(1024 * 2**0.5)
     assert torch.equal(LensBlur()(image, coc=coc, motion=motion), image)
+
+
+@pytest.mark.parametrize("quality", ["exact", "balanced", "fast"])
+@pytest.mark.parametrize("seed", [15, 23, 41])
+def test_a_huge_blur_in_motion_leaves_no_negative_light_and_none_above_the_picture(quality: str, seed: int) -> None:
+    """Splats of radii up to 22000 px leave less on a pixel than sparse PSFs leave of rounding."""
+    g = draw(seed)
+    height, width = (int(n) for n in torch.randint(3, 60, (2,), generator=g))
+    image = torch.rand(1, 3, height, width, generator=g)
+    largest = 10 ** float(torch.rand((), generator=g) * 5.2)
+    coc = (torch.rand(1, 1, height, width, generator=g) * 2 - 1) * largest
+    motion = (torch.rand(1, 2, height, width, generator=g) * 2 - 1) * 10 ** float(torch.rand((), generator=g) * 3)
+    out = LensBlur(quality=quality)(image, coc=coc, motion=motion)
+    assert out.min() >= 0
+    assert out.max() <= image.max()
