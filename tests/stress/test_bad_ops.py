@@ -269,7 +269,7 @@ def test_each_bad_argument_is_named(name: str, one_by_one: Callable[[Any], list[
     assert not wrong, "\n".join(wrong)
 
 
-HELPERS = {"checks", "dispatch", "onnx_functions", "cie_1931", "span_gradient"}
+HELPERS = {"checks", "dispatch", "onnx_functions", "cie_1931", "span_gradient", "highlights"}
 """Modules that take no arguments of a caller's: checks themselves, which way is taken, tables, parts of an operator."""
 
 

@@ -5,6 +5,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -98,7 +99,8 @@ def _highlights(side: int) -> Iterator[Row]:
         want, errors = dense[:, :1] / dense[:, 1:], []
         for setting in (change[1], getattr(highlights, change[0])):
             with mock.patch.object(highlights, change[0], setting):
-                errors.append(float((splatting(image, coc, motion=way) - want).abs().max() / want.max()))
+                plan = replace(splatting.plan(image, coc, motion=way), surrounded=0, lit=0.0)
+                errors.append(float((splatting(image, coc, motion=way, plan=plan) - want).abs().max() / want.max()))
         yield _row(name, f"error of a bokeh of {size} x {size} pixels of 3e5, of its maximum", *errors)
     yield _region(side)
 

@@ -130,9 +130,8 @@ def with_ground_around(image: Tensor, width: int, colours: int) -> Tensor:
         colours: how many channels are colours. What is a highlight in one is left out of all, and of coverage.
     """
     least = LEAST_CONTRAST * ordinary_brightness(image, torch.ones_like(image[:, :1]), CLIPPED)
-    ordinary = (2 - image.abs() / least.clamp_min(torch.finfo(image.dtype).tiny)).clamp(1e-9, 1)
-    # A pixel alone counts for little, blocks of so many for what they are: what goes on is smooth.
-    ground = pull_push(image, ordinary[:, :colours].amin(1, keepdim=True) / COARSE**2)
+    ordinary = (2 - image.abs() / least.clamp_min(torch.finfo(image.dtype).tiny)).clamp(0, 1)
+    ground = pull_push(image, ordinary[:, :colours].amin(1, keepdim=True))
     inside = F.pad(torch.ones_like(image[:1, :1], dtype=torch.bool), (width,) * 4)
     return torch.where(inside, F.pad(image, (width,) * 4), F.pad(ground, (width,) * 4, mode="replicate"))
 

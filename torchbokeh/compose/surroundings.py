@@ -26,12 +26,14 @@ class Surrounding(NamedTuple):
             return request
         image, coc, motion, behind = request.image, request.coc, request.motion, request.background
         if request.layered:
-            alpha = image[:, :, 3:].flatten(0, 1)
+            alpha = image[:, :, -1:].flatten(0, 1)
 
             def map_of(t: Tensor) -> Tensor:
                 return self._edges(continued(t.flatten(0, 1), alpha, COARSE)).unflatten(0, t.shape[:2])
 
-            colours = with_ground_around(image.flatten(0, 1), self.width, 3).unflatten(0, image.shape[:2])
+            colours = with_ground_around(image.flatten(0, 1), self.width, image.shape[2] - 1).unflatten(
+                0, image.shape[:2]
+            )
             return request._replace(image=colours, coc=map_of(coc), motion=motion.mapped(map_of))
         if behind is not None:
             behind = (

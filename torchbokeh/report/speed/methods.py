@@ -1,7 +1,7 @@
 """What is compared: every way to blur one layer is a `Method`, image and CoC in, image out."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -67,5 +67,9 @@ def _own(quality: str) -> Method:
     def work(coc: Tensor) -> float:
         return coc.numel() * 4e-9 * (20 + 2 * coc.abs().mean().item())  # at most: two points for every row of a disc
 
+    def blur(image: Tensor, coc: Tensor) -> Tensor:
+        # Like the others, and the reference: what lies beyond the border is not known, lights or not.
+        return splatting(image, coc, plan=replace(splatting.plan(image, coc), surrounded=0, lit=0.0))
+
     how = "two points for every row of a disc" + ("" if quality == "exact" else ", wide discs merged by radius")
-    return Method(own_name(quality), OWN, f"KernelSplatting(quality={quality!r}): {how}", splatting, work)
+    return Method(own_name(quality), OWN, f"KernelSplatting(quality={quality!r}): {how}", blur, work)
