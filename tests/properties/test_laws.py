@@ -69,14 +69,13 @@ def test_scenes_of_every_kind_keep_the_law(law: Law) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 @pytest.mark.parametrize("law", laws())
-def test_thousands_of_scenes_keep_the_law(law: Law) -> None:
+def test_scenes_of_all_sizes_keep_the_law(law: Law) -> None:
+    """As many as there is time for where every change is tested; the search goes on from there."""
     rng = np.random.default_rng(7)
-    found = [tried(law, draw(rng, LARGE)) for _ in range(25 * law.tries)]
-    shares = [one.share for one in found if one is not None]
-    assert len(shares) > 200
-    assert max(shares) <= law.most
-    assert sum(share > 1 for share in shares) <= len(shares) / 1000
+    for _ in range(law.tries // 4 + 1):
+        keeps(law, draw(rng, LARGE))
 
 
 @pytest.mark.parametrize(("name", "scene"), FOUND)

@@ -54,7 +54,9 @@ def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 
     low, high = samples.coc.detach().aminmax()
     bins = _splat_bins(samples, bin_centres(float(low), float(high), layers), bank)
     colour, coverage = fill_until_full([(b[:, :-1], b[:, -1:]) for b in bins])
-    return pull_push(colour, (coverage / KNOWN).clamp(0, 1)).to(dtype)
+    # Sparse PSFs leave ripples, and beside a light these would be more than a mean can be.
+    low, high = (end((1, 3, 4))[..., None, None] for end in (samples.colour.amin, samples.colour.amax))
+    return pull_push(colour.clamp(low, high), (coverage / KNOWN).clamp(0, 1)).to(dtype)
 
 
 def _checked_bank(bank: PsfBank) -> PsfBank:
