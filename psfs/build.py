@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import os
+import pickle
 import shutil
 import time
 from collections.abc import Iterator
@@ -127,7 +128,9 @@ def _part(parts: Path, number: int) -> Path:
 
 def _finished(model: PsfModel, numbers: list[int], target: Target, workers: int, parts: Path) -> Iterator[int]:
     """Build samples, largest first, and tell the number of each when it is written."""
-    jobs = [(model, k, target, _part(parts, k)) for k in reversed(numbers)]
+    # By value: tensors would be handed over by a thread that a killed worker leaves with an error of its own.
+    pickled = pickle.dumps(model)
+    jobs = [(pickled, k, target, _part(parts, k)) for k in reversed(numbers)]
     if not jobs:
         return
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), end_with_parent)
@@ -161,8 +164,8 @@ def _single_threads() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _job(model: PsfModel, number: int, target: Target, path: Path) -> int:
-    found = build_sample(model, number, target)
+def _job(pickled: bytes, number: int, target: Target, path: Path) -> int:
+    found = build_sample(pickle.loads(pickled), number, target)
     (domain, (points, values)), *scores = found
     with replacing(path) as temporary:
         np.savez(temporary, domain=domain, points=points, values=values, scores=np.array(scores))
