@@ -218,7 +218,10 @@ class KernelSplatting(nn.Module):
             if not plan.lit:
                 return self._splatted(request, plan, profile)
             whole = around.cut(self._splatted(around.of(request), plan, profile))
-            return whole if plan.lit == 1 else torch.lerp(self._splatted(request, plan, profile), whole, plan.lit)
+            # Not lerp, which rounds by where threads divide the work.
+            if plan.lit == 1:
+                return whole
+            return plan.lit * whole + (1 - plan.lit) * self._splatted(request, plan, profile)
 
     def _splatted(self, request: Request, plan: SplattingPlan, profile: Profile) -> Tensor:
         image, coc, labels = request.image, request.coc, request.labels

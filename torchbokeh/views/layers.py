@@ -99,7 +99,9 @@ def accumulate_layers(
     request = around.of(Request(layers, coc, Motion(() if motion is None else (motion,)), None, Sensor((h, w))))
     maps = request.image, request.coc, motion if motion is None else request.motion.displacements[0]
     whole = around.cut(_accumulated(*maps, views, prism, settings, around.width))
-    return whole if lit == 1 else torch.lerp(_accumulated(layers, coc, motion, views, prism, settings), whole, lit)
+    if lit == 1:
+        return whole
+    return lit * whole + (1 - lit) * _accumulated(layers, coc, motion, views, prism, settings)
 
 
 def _accumulated(
