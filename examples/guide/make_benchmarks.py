@@ -28,7 +28,7 @@ def keep(report: Path) -> Path:
     found = _rounded(json.loads(report.read_text(encoding="utf-8")))
     command = ["git", "-C", str(HERE), "rev-parse", "--short", "HEAD"]
     found["commit"] = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-    for row in found["experiments"]["chromatic_bands"]:
+    for row in found["experiments"].get("chromatic_bands", []):
         row.pop("profile", None)  # for a plot
     DATA.mkdir(exist_ok=True)
     path = DATA / f"{report.resolve().parent.name}.json"
