@@ -79,7 +79,8 @@ def _by_plan(plan: Plan, blur: LensBlur, image: Tensor, coc: Tensor, behind: tup
 def over(sheets: Sequence[Sheet], pieces: Sequence[Profile]) -> tuple[Tensor, Tensor]:
     """Sheets over one another, front to back, through every piece of the lens, and the mean of all pieces.
 
-    A piece has a say in a pixel as far as it knows what is there: where splats of a sheet without holes reach it.
+    A piece has a say in a pixel as far as it knows what is there: where splats of a sheet without holes reach it. Of
+    a sheet that lets light through it has to know what is behind, or what stops light there would count for more.
 
     Returns:
         Colour ``(B, C, H, W)``, premultiplied, and coverage ``(B, 1, H, W)``.
@@ -89,18 +90,29 @@ def over(sheets: Sequence[Sheet], pieces: Sequence[Profile]) -> tuple[Tensor, Te
         blurs = [blurred(sheet, piece) for sheet in sheets]
         left = torch.full_like(sheets[0].coc, float(area(piece)))
         votes: list[tuple[Tensor, Tensor, Tensor]] = []
-        known = left
-        for sheet, (mean, stopped, density) in zip(sheets, blurs, strict=True):
-            known = (CERTAIN * density).clamp(max=1)
-            votes.append((left * stopped * known, mean, density))
-            nothing = torch.zeros_like(left) if sheet.opaque else (sheet.alpha == 0).double()
-            left = left * (known * (1 - stopped) + (1 - known) * nothing)
+        parts = [
+            (
+                stopped,
+                (CERTAIN * density).clamp(max=1),
+                torch.zeros_like(left) if sheet.opaque else (sheet.alpha == 0) * 1.0,
+            )
+            for sheet, (_, stopped, density) in zip(sheets, blurs, strict=True)
+        ]
+        # How much is known of all from each sheet on backwards: of what stops light, all that is there.
+        told = [torch.ones_like(left)]
+        for stopped, known, nothing in reversed(parts):
+            ahead = known * (stopped + (1 - stopped) * told[0])
+            told.insert(0, nothing * told[0] + (1 - nothing) * ahead)
+        for number, ((stopped, known, nothing), (mean, _, density)) in enumerate(zip(parts, blurs, strict=True)):
+            votes.append((left * stopped * known * (stopped + (1 - stopped) * told[number + 1]), mean, density))
+            goes_on = (1 - known) * nothing if number < len(sheets) - 1 else 0.0
+            left = left * (known * (1 - stopped) + goes_on)
         total = torch.stack([vote for vote, _, _ in votes]).sum(0)
         crowd = torch.stack([vote * density for vote, _, density in votes]).sum(0)
         # Evenly lit whatever the blur does around: weighted by how dense the splats are that are seen.
         dense = torch.where(total > TINY, crowd / total.clamp_min(TINY), blurs[-1][2])
         seen = torch.stack([vote * mean for vote, mean, _ in votes]).sum(0)
-        for out, more in zip(sums, (dense * seen, dense * total, dense * (total + left * known)), strict=True):
+        for out, more in zip(sums, (dense * seen, dense * total, dense * (total + left)), strict=True):
             out += more
     whole = sums[2].clamp_min(TINY**2)
     return sums[0] / whole, sums[1] / whole

@@ -152,8 +152,9 @@ def _over(front, certain, ahead, whole, behind, y0, y1):  # type: ignore[no-unty
             stopped = min(covered[x] / max(full[x], tiny), one)
             known = min(certain * max(full[x], zero), one)
             absent = one if share_ahead[x] == zero else zero
-            vote = stopped * known
-            left = (absent + known * (one - stopped - absent)) * min(certain * count[x], one)
+            told = min(certain * count[x], one)
+            vote = stopped * known * (stopped + (one - stopped) * told)
+            left = (absent + known * (one - stopped - absent)) * told
             total = max(vote + left, tiny * tiny)
             share[x], rest[x] = vote / total, left / total
         for k in range(channels):

@@ -71,8 +71,9 @@ def compose(
 
     Through one small piece of the lens, what is in front covers what is behind almost as in a pinhole picture; the
     mean over the pieces keeps the relation of coverage to lens position that one "over" of fully blurred surfaces
-    loses. A part of the view that nothing is known of, beyond the border or behind an edge, gets no vote. Pieces are
-    weighted by the density of their splats: a highlight is lit evenly, whatever the blur does around it.
+    loses. A part of the view that nothing is known of, beyond the border or behind an edge, gets no vote; nor do what
+    stops light before it and what lets it through, in the same proportion. Pieces are weighted by the density of their
+    splats: a highlight is lit evenly, whatever the blur does around it.
 
     Args:
         surfaces: front to back.
@@ -86,22 +87,25 @@ def compose(
     colour = torch.zeros_like(surfaces[0].colour)
     covered = total = zero
     for profile in pieces:
-        seen = torch.zeros_like(colour)
-        votes = densities = zero
-        left = zero + area(profile).to(zero.dtype)
-        for surface in surfaces:
+        seen, votes, densities, left, told = torch.zeros_like(colour), zero, zero, zero + 1, zero + 1
+        last = len(surfaces) - 1
+        for number in range(last, -1, -1):  # from the back, as each has to know what is told of all behind it
+            surface = surfaces[number]
             mean, stopped, density = blurred(surface, profile, detail)
             known = (CERTAIN * density).clamp(max=1)
-            vote = left * stopped * known
-            seen = seen + vote * mean
-            votes = votes + vote
-            densities = densities + vote * density
+            vote = stopped * known * (stopped + (1 - stopped) * told)
             # Where a surface is and no splat says how much it stops, the piece has no vote on what is behind either.
             absent = torch.zeros_like(known) if surface.alpha is None else (surface.alpha == 0).to(known.dtype)
-            left = left * (absent + known * (1 - stopped - absent))
-        density = torch.where(votes > TINY, densities / votes.clamp_min(TINY), density)
+            passing = absent * (known if number == last else 1) + known * (1 - stopped - absent)
+            seen = vote * mean + passing * seen
+            votes, densities = vote + passing * votes, vote * density + passing * densities
+            left, told = passing * left, absent * told + (1 - absent) * known * (stopped + (1 - stopped) * told)
+            if number == last:
+                behind = density
+        weight = area(profile).to(zero.dtype)
+        density = weight * torch.where(votes > TINY, densities / votes.clamp_min(TINY), behind)
         colour = colour + density * seen
         covered = covered + density * votes
-        total = total + density * (votes + left * known)
+        total = total + density * (votes + left)
     total = total.clamp_min(TINY**2)  # the density counts twice
     return colour / total, covered / total

@@ -20,6 +20,9 @@ from torchbokeh.plan.bins import FOREGROUND
 COARSE = 4
 """Where pixels are merged, what is hidden is filled in blocks of this many pixels each way."""
 
+STRIP = 32
+"""From so many px along a border is it known how the picture goes on beyond it."""
+
 CLIPPED = 3
 """How often what is ordinary at a border is found anew, so that none of many lights there hides another."""
 
@@ -129,11 +132,32 @@ def with_ground_around(image: Tensor, width: int, colours: int) -> Tensor:
         width: px.
         colours: how many channels are colours. What is a highlight in one is left out of all, and of coverage.
     """
-    least = LEAST_CONTRAST * ordinary_brightness(image, torch.ones_like(image[:, :1]), CLIPPED)
-    ordinary = (2 - image.abs() / least.clamp_min(torch.finfo(image.dtype).tiny)).clamp(0, 1)
-    ground = pull_push(image, ordinary[:, :colours].amin(1, keepdim=True))
-    inside = F.pad(torch.ones_like(image[:1, :1], dtype=torch.bool), (width,) * 4)
-    return torch.where(inside, F.pad(image, (width,) * 4), F.pad(ground, (width,) * 4, mode="replicate"))
+    least = LEAST_CONTRAST * ordinary_brightness(image, clipped=CLIPPED)
+    least = least.clamp_min(torch.finfo(image.dtype).tiny)
+
+    def outermost(image: Tensor) -> Tensor:
+        """The ground of the first row."""
+        strip = image[..., :STRIP, :]
+        ordinary = (2 - strip.abs() / least).clamp(0, 1)
+        return pull_push(strip, ordinary[:, :colours].amin(1, keepdim=True))[..., :1, :]
+
+    above, below = outermost(image), outermost(image.flip(-2))
+    left, right = outermost(image.mT).mT, outermost(image.mT.flip(-2)).mT
+    # In a corner, both borders have something to say.
+    ends = [
+        [
+            0.5 * (row[..., k : k + 1] + column[..., i : i + 1, :])
+            for column, k in ((left, 0), (right, -1 % image.shape[-1]))
+        ]
+        for row, i in ((above, 0), (below, -1 % image.shape[-2]))
+    ]
+    rows = [
+        torch.cat([one.expand(*one.shape[:3], width), row, other.expand(*one.shape[:3], width)], -1)
+        for row, (one, other) in zip((above, below), ends, strict=True)
+    ]
+    middle = torch.cat([left.expand(*left.shape[:3], width), image, right.expand(*left.shape[:3], width)], -1)
+    above, below = (row.expand(-1, -1, width, -1) for row in rows)
+    return torch.cat([above, middle, below], -2)
 
 
 def _ordinary(image: Tensor, known: Tensor) -> Tensor:

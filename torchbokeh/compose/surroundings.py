@@ -7,11 +7,14 @@ its own ground, continued without its lights: then every disc is whole, and the 
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchbokeh.compose.surfaces import COARSE, continued, with_ground_around
+from torchbokeh.ops.composite import TINY
 from torchbokeh.picture.request import Request
+from torchbokeh.picture.samples import Samples, pixel_positions
 from torchbokeh.psfs.model import Labels
 
 
@@ -47,6 +50,27 @@ class Surrounding(NamedTuple):
             motion=motion.mapped(self._edges),
             background=behind,
             labels=None if labels is None else Labels(*(None if t is None else self._edges(t) for t in labels)),
+        )
+
+    def of_samples(self, samples: Samples) -> Samples:
+        """Samples, surrounded: beyond the border, through the middle of the lens at the middle of the exposure."""
+        present = samples.present.to(samples.colour)
+        known = torch.cat([samples.colour * present, present], 2).flatten(0, 1)
+        ground = with_ground_around(known, self.width, 3).unflatten(0, present.shape[:2])
+        colour, covered = ground[:, :, :3], ground[:, :, 3:]
+        coc, motion, there = (
+            self._edges(t.flatten(0, 1)).unflatten(0, present.shape[:2]) for t in (samples.coc, samples.motion, present)
+        )
+        within = samples.position - pixel_positions(samples.position)
+        off, lens, time = (F.pad(t, (self.width,) * 4) for t in (within, samples.lens, samples.time))
+        return Samples(
+            colour=colour / covered.clamp_min(TINY),
+            position=pixel_positions(colour) + off,
+            lens=lens,
+            time=time,
+            coc=coc,
+            motion=motion,
+            present=(there > 0) & (covered > 0),
         )
 
     def cut(self, picture: Tensor) -> Tensor:

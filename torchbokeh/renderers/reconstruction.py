@@ -1,13 +1,18 @@
 """Reconstruction from stochastic samples: each spreads its PSF about where a pinhole would see it (LKS section 6.2)."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from torchbokeh.banks.splat import bank_of_motion, splat_bank
+from torchbokeh.compose.surroundings import Surrounding
 from torchbokeh.ops.checks import check_whole
 from torchbokeh.ops.composite import bin_weights, fill_until_full, pull_push
 from torchbokeh.picture.samples import Samples, checked_samples, pinhole_position, pixel_positions
 from torchbokeh.plan.bins import bin_centres
+from torchbokeh.plan.decide import passed
+from torchbokeh.plan.lights import BRIGHTER, lights_at_border
 from torchbokeh.psfs.bank import PsfBank
 from torchbokeh.psfs.model import Labels
 
@@ -23,7 +28,8 @@ def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 
     samples in the middle of their pixels, of the lens and of the exposure.
 
     Samples are put into soft bins of constant parallax, and what a bin covers hides what is behind it: light from
-    behind does not leak over edges that are sharper. One layer is the plain mean of all PSFs.
+    behind does not leak over edges that are sharper. One layer is the plain mean of all PSFs. Where lights near the
+    border would show that nothing is known of what lies beyond it, the picture goes on there without them.
 
     Args:
         samples: see `Samples`, and `torchbokeh.scenes.samples`, which casts them.
@@ -51,12 +57,32 @@ def reconstruct(samples: Samples, *, bank: PsfBank | None = None, layers: int = 
     samples, dtype = checked_samples(samples), samples.colour.dtype
     bank = bank_of_motion(samples.colour.device) if bank is None else _checked_bank(bank)
     check_whole("layers", layers, 1)
+    # What an item needs does not depend on the others.
+    return torch.cat(
+        [_of_one(Samples(*item), bank, layers) for item in zip(*(t.split(1) for t in samples), strict=True)]
+    ).to(dtype)
+
+
+def _of_one(samples: Samples, bank: PsfBank, layers: int) -> Tensor:
+    """The picture of a batch of one, surrounded where there are lights near the border."""
+    coc, (height, width) = samples.coc.detach(), samples.coc.shape[3:]
+    largest, farthest = float(coc.abs().max()), float(samples.motion.detach().norm(dim=2).max())
+    lit = passed(lights_at_border(samples.colour[0], coc[0], largest, farthest), BRIGHTER)
+    plain = _mean_of(samples, bank, layers) if lit < 1 else 0.0
+    if not lit:
+        return plain
+    around = Surrounding(min(math.ceil(largest + farthest), min(height, width) // 2))
+    whole = around.cut(_mean_of(around.of_samples(samples), bank, layers))
+    return lit * whole + (1 - lit) * plain
+
+
+def _mean_of(samples: Samples, bank: PsfBank, layers: int) -> Tensor:
     low, high = samples.coc.detach().aminmax()
     bins = _splat_bins(samples, bin_centres(float(low), float(high), layers), bank)
     colour, coverage = fill_until_full([(b[:, :-1], b[:, -1:]) for b in bins])
     # Sparse PSFs leave ripples, and beside a light these would be more than a mean can be.
     low, high = (end((1, 3, 4))[..., None, None] for end in (samples.colour.amin, samples.colour.amax))
-    return pull_push(colour.clamp(low, high), (coverage / KNOWN).clamp(0, 1)).to(dtype)
+    return pull_push(colour.clamp(low, high), (coverage / KNOWN).clamp(0, 1))
 
 
 def _checked_bank(bank: PsfBank) -> PsfBank:

@@ -11,6 +11,7 @@ from torch import Tensor
 import torchbokeh as tb
 from torchbokeh.compose.surroundings import Surrounding
 from torchbokeh.picture.request import Optics, Request
+from torchbokeh.picture.samples import Samples, pixel_positions
 
 H, W, R = 64, 90, 12.0
 THIN = tb.ThinLens(focal_length=0.05, f_number=1.4, focus_distance=0.6, sensor_width=0.036)
@@ -62,11 +63,18 @@ def in_colours(image: Tensor, quality: str) -> Tensor:
     return tb.ChromaticAccumulation(THIN, views=64)(with_alpha(image), torch.full((1, 1, 1, H, W), 0.9))[:, :3]
 
 
+def reconstructed(image: Tensor, quality: str) -> Tensor:
+    still = torch.zeros(1, 1, 2, H, W)
+    middles = pixel_positions(still)[None, None]
+    taken = torch.ones(1, 1, 1, H, W, dtype=torch.bool)
+    return tb.reconstruct(Samples(image[None], middles, still, still[:, :, :1], ramp()[None], still + 3.0, taken))
+
+
 Renderer = Callable[[Tensor, str], Tensor]
 QUALITIES = ("exact", "high", "balanced", "fast")
 EVERY = [
     *((r, q) for r in (lens_blur, foreground, layers, moving, splatting) for q in QUALITIES),
-    *((r, "exact") for r in (even, banks, accumulated, in_colours)),
+    *((r, "exact") for r in (even, banks, accumulated, in_colours, reconstructed)),
 ]
 
 
@@ -125,6 +133,13 @@ def test_lights_do_not_go_on_and_alpha_does() -> None:
     around[9:-9, 9:-9] = False
     assert wide[:, :, :3, around].sub(0.25).abs().max() < 1e-3
     assert wide[:, :, 3, around].sub(0.5).abs().max() < 1e-6
+
+
+def test_faint_layers_stay_faint_where_a_piece_of_the_lens_looks_past_the_border() -> None:
+    rgba = 1e-4 * torch.rand(1, 2, 4, 16, 32, generator=torch.Generator().manual_seed(0))
+    coc = torch.tensor([24.0, -24.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 1, 16, 32)
+    for pieces in (1, 2, 3):
+        assert tb.LensBlur(subapertures=pieces)(rgba, coc=coc)[:, 3].max() < 2e-4
 
 
 def test_nothing_around_is_the_request_itself() -> None:
