@@ -6,15 +6,16 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_image, check_kind, check_whole
+from torchbokeh.ops.outline import Arcs, arcs_of, crossings, edge_at
 from torchbokeh.ops.points import PointTable
-from torchbokeh.ops.spans import Profile, check_profile, clamp_radius, row_span
+from torchbokeh.ops.spans import Profile, area, check_profile, clamp_radius, edge_integrals
 
 
 def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
     """Blur with flat convex PSFs, pixel by pixel: `splat_spans(..., integrate=True)` without its differences.
 
-    Every PSF is drawn row by row; a row adds to each output pixel the length by which the two overlap, times the
-    row's weight. Takes time and memory in proportion to ``B * H * W * W`` for each of ``2 H - 1`` rows.
+    Every PSF is drawn row by row: each output pixel gets the share of the shape that covers it. Takes time and memory
+    in proportion to ``B * H * W * W`` for each of ``2 H - 1`` rows.
 
     Args:
         values: ``(B, C, H, W)``.
@@ -42,16 +43,41 @@ def dense_spans(values: Tensor, coc: Tensor, profile: Profile) -> Tensor:
     values = values.double()
     radius = clamp_radius(coc.double().reshape(-1))
     profile = Profile(profile.knots.double(), profile.bulge.double())
-    column = torch.arange(w, dtype=torch.float64, device=values.device)
-    out = torch.zeros_like(values)
+    arcs, out = arcs_of(profile), torch.zeros(b * h, w, values.shape[1], dtype=torch.float64, device=values.device)
+    flat, where = values.movedim(1, 3).reshape(b * h * w, -1), torch.arange(b * h * w, device=values.device)
+    borders = torch.arange(w + 1, device=values.device) - 0.5
     for row in range(1 - h, h):
-        left, right, weight = (t.reshape(b, h, w, 1) for t in row_span(radius, row, profile))
-        start, stop = left + column[:, None], right + column[:, None]
-        overlap = torch.minimum(stop, column + 0.5) - torch.maximum(start, column - 0.5)
-        share = overlap.clamp_min(0) * weight
-        source, target = slice(max(-row, 0), min(h - row, h)), slice(max(row, 0), min(h + row, h))
-        out[:, :, target] += torch.einsum("bcyx,byxu->bcyu", values[:, :, source], share[:, source])
-    return out
+        ends = ((row + radius.new_tensor([[-0.5], [0.5]])) / radius).sort(0).values
+        low, high = ends.clamp(profile.knots[0, 0], profile.knots[-1, 0])
+        seen = (where // w % h + row >= 0) & (where // w % h + row < h) & (high > low)
+        pixel = where[seen]
+        x = (borders - (pixel % w)[:, None]) / radius[pixel, None]
+        left, right = (_area_before(x, low[pixel], high[pixel], profile, arcs, side) for side in (0, 1))
+        share = (left - right).diff(dim=1).abs() / area(profile)
+        out.index_add_(0, pixel // w + row, share[..., None] * flat[pixel, None])
+    return out.reshape(b, h, w, -1).movedim(3, 1).contiguous()
+
+
+def _area_before(x: Tensor, low: Tensor, high: Tensor, profile: Profile, arcs: Arcs, side: int) -> Tensor:
+    """Area ``(N, M)`` from an edge of the unit shape (0: left, 1: right) to ``x (N, M)``, at ``low .. high`` in y."""
+    low, high = (t[:, None].expand_as(x).reshape(-1) for t in (low, high))
+    flat, crossed = x.reshape(-1), []
+    # Between two heights, x is beyond the left edge, or before the right one.
+    for arc, end in ((2 * side, 0), (2 * side + 1, 1)):
+        number = torch.full_like(flat, arc, dtype=torch.int64)
+        outer = arcs.ends[arc, end].expand_as(flat)
+        edge = edge_at(profile, number, outer)
+        further = flat > edge if side == 0 else flat < edge
+        crossed.append(torch.where(further, outer, crossings(profile, arcs, number, flat)))
+    lower, upper = torch.maximum(crossed[0], low), torch.minimum(crossed[1], high)
+    upper = torch.maximum(lower, upper)
+
+    def between(one: Tensor, other: Tensor) -> Tensor:
+        edges = edge_integrals(profile, other) - edge_integrals(profile, one)
+        return flat * (other - one) - edges[:, side]
+
+    found = between(lower, upper) if side == 0 else between(low, high) - between(lower, upper)
+    return found.reshape(x.shape)
 
 
 def dense_points(

@@ -39,6 +39,9 @@ from torchbokeh.ops.splat import splat_spans
 FADE = 0.125
 """Radii from one to ``1 + FADE`` times the least radius of a level belong partly to the level below."""
 
+LIT = 0.75
+"""A pixel that has this much of the brightness of a highlight begins to be one: nothing jumps as a light grows."""
+
 STEPS = 9216
 """Radii in cells are rounded, so that few PSFs are drawn: small ones to steps of ``1 / radius``, this many to 1, since
 the weights of small PSFs change fast: by up to 2e-4 from one step to the next."""
@@ -66,8 +69,9 @@ class Merging(NamedTuple):
 
     Attributes:
         cells: a PSF spans at least this radius in cells of its level; more is more exact, and slower.
-        highlight: a pixel is a highlight where it is brighter, by its channel's mean, than ``highlight`` times its
-            squared radius (and `LEAST_CONTRAST`): spread over its disc, it then stands out by ``highlight / pi``.
+        highlight: a pixel is a highlight, no part of which is merged, where it is brighter, by its channel's mean, than
+            ``highlight`` times its squared radius (and `LEAST_CONTRAST`): spread over its disc, it then stands out by
+            ``highlight / pi``.
     """
 
     cells: float
@@ -93,7 +97,9 @@ def level_shares(
     counted = torch.ones_like(values[:, :1]) if weight is None else weight.detach().to(values.dtype)
     mean = ordinary_brightness(values, counted)
     bound = (merging.highlight * radius.square()).clamp_min(LEAST_CONTRAST)
-    ordinary = ~(values.abs() > mean * bound).any(1, keepdim=True)
+    ratio = (values.abs() / (mean * bound).clamp_min(torch.finfo(values.dtype).tiny)).amax(1, keepdim=True)
+    lit = ((ratio - LIT) / (1 - LIT)).clamp(max=1)
+    ordinary = 1 - torch.where(lit > 0, lit, 0.0)  # beside what is infinite, all others are no numbers
     above = [torch.ones_like(radius)]
     for level in range(1, highest + 1):
         excess = radius / (merging.cells * 2**level) - 1

@@ -1,9 +1,7 @@
 """What the operators of this package become in an exported ONNX file: standard operators only.
 
 `splat_rows`, what it calls, `halved` and `doubled` are functions of the file. `splat_rows` is a loop over the rows of
-the PSFs, as `torchbokeh.ops.splat` has it. Two things differ there, since onnxruntime has no arc functions in double:
-the angle between the two ends of a slab is taken in float32, from its sine and cosine in double, so that it is exact to
-a relative 1e-7; and knots are found by halving.
+the PSFs, as `torchbokeh.ops.splat` has it.
 """
 
 # ruff: noqa: F821 (names of sizes)
@@ -12,68 +10,25 @@ import onnx
 import torch
 from onnxscript import DOUBLE, FLOAT, INT64, ir, script
 from onnxscript import opset18 as op
-from onnxscript.values import Op, Opset
+from onnxscript.values import Op
 
-DOMAIN = Opset("torchbokeh", 1)
+from torchbokeh.ops.onnx_outline import DOMAIN, FUNCTIONS, mean_edges, row_pieces, side_arcs
+
 HALF_PI = 1.5707963267948966
 LEVELS = 14
 """Of the pyramid of `pull_push`: enough for 16384 px. From one pixel on, a further level changes nothing."""
 
 
 @script(DOMAIN)
-def edge_integrals(
-    ends: DOUBLE["N"],
-    knots: DOUBLE["K", 3],
-    integrals: DOUBLE["K", 2],
-    slopes: DOUBLE["S", 2],
-    strides: INT64["T"],
-) -> DOUBLE["N", 2]:
-    """Integrals of the left and right edge up to the heights ``ends``; knots are found by halving, two need none."""
-    heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
-    last = op.Size(heights) - 2
-    found = op.Cast(op.CastLike(0.0, ends) * ends, to=INT64.dtype)
-    halvings = op.Size(strides)
-    for step in range(halvings):
-        further = op.Min(found + op.Gather(strides, step), last)
-        found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
-    beyond = op.Unsqueeze(ends - op.Gather(heights, found), [1])
-    edges = op.Slice(knots, [1], [3], [1])
-    edge = op.Gather(edges, found) + op.CastLike(0.5, ends) * op.Gather(slopes, found) * beyond
-    return op.Gather(integrals, found) + beyond * edge
-
-
-@script(DOMAIN)
-def arc_integral(u: DOUBLE["N"], v: DOUBLE["N"]) -> DOUBLE["N"]:
-    """Integral of ``sqrt(1 - x²)`` from u to v: the angle between is twice that whose tangent is sin / (1 + cos)."""
-    zero = op.CastLike(0.0, u)
-    half = op.CastLike(0.5, u)
-    one = op.CastLike(1.0, u)
-    at_u = op.Sqrt(op.Max(one - u * u, zero))
-    at_v = op.Sqrt(op.Max(one - v * v, zero))
-    sine = v * at_u - u * at_v
-    cosine = u * v + at_u * at_v
-    obtuse = op.Less(cosine, zero)
-    tiny = op.CastLike(1e-12, u)
-    tangent = op.Where(obtuse, one - cosine, sine) / op.Where(obtuse, op.Max(sine, tiny), one + cosine)
-    angle = op.CastLike(2.0, u) * op.Cast(op.Atan(op.Cast(tangent, to=FLOAT.dtype)), to=DOUBLE.dtype)
-    return half * (v * at_v - u * at_u + angle)
-
-
-@script(DOMAIN)
 def add_differences(
-    buffer: DOUBLE["C", "P"], base: INT64["N"], left: DOUBLE["N"], right: DOUBLE["N"], share: DOUBLE["C", "N"]
+    buffer: DOUBLE["C", "P"], index: INT64["M"], part: DOUBLE["M"], share: DOUBLE["C", "M"]
 ) -> DOUBLE["C", "P"]:
-    """Add the two differences of each row that begins at ``base`` and runs from ``left`` to ``right``."""
-    left_column = op.Floor(left)
-    right_column = op.Floor(right)
-    left_index = base + op.Cast(left_column, to=INT64.dtype)
-    right_index = base + op.Cast(right_column, to=INT64.dtype)
-    left_next = share * (left - left_column)
-    right_next = share * (right - right_column)
-    index = op.Concat(left_index, left_index + 1, right_index, right_index + 1, axis=0)
-    update = op.Concat(share - left_next, left_next, right_next - share, op.Neg(right_next), axis=1)
+    """Add to the columns ``index`` and to the next, by the ``part`` of these."""
+    behind = share * part
+    both = op.Concat(index, index + 1, axis=0)
+    update = op.Concat(share - behind, behind, axis=1)
     # Not ScatterND: the threads of onnxruntime lose some of what it adds to one place.
-    return op.ScatterElements(buffer, op.Expand(index, op.Shape(update)), update, axis=1, reduction="add")
+    return op.ScatterElements(buffer, op.Expand(both, op.Shape(update)), update, axis=1, reduction="add")
 
 
 @script(DOMAIN)
@@ -91,7 +46,6 @@ def splat_rows(
     zero = op.CastLike(0.0, coc)
     half = op.CastLike(0.5, coc)
     one = op.CastLike(1.0, coc)
-    tiny = op.CastLike(1e-12, coc)
     shape = op.Shape(values)
     channels = op.Slice(shape, [1], [2])
     height = op.Squeeze(op.Slice(shape, [2], [3]))
@@ -106,10 +60,11 @@ def splat_rows(
     y = op.Mod(op.Div(where, width), height)
     x = op.Cast(op.Mod(where, width), to=DOUBLE.dtype) + half
     reach = op.Min(op.Cast(op.ReduceMax(op.Abs(radius), keepdims=0), to=INT64.dtype) + 1, height - 1)
-    bottom = op.Squeeze(op.Slice(knots, [0, 0], [1, 1]))
-    top = op.Squeeze(op.Slice(knots, [-1, 0], [2147483647, 1]))
-    middle = half * (top + bottom)
-    extent = half * (top - bottom)
+    left_turn, left_pieces, left_keys = side_arcs(op.Constant(value_int=0), knots, slopes, bulge, strides)
+    right_turn, right_pieces, right_keys = side_arcs(op.Constant(value_int=2), knots, slopes, bulge, strides)
+    turns = op.Concat(op.Reshape(left_turn, [1]), op.Reshape(right_turn, [1]), axis=0)
+    pieces = op.Concat(left_pieces, right_pieces, axis=0)
+    keys = op.Concat(left_keys, right_keys, axis=0)
     cells = op.Div(count, width) * (width + 2)
     buffer = op.Expand(zero, op.Concat(channels, op.Reshape(cells, [1]), axis=0))
     for k in range(2 * reach + 1):
@@ -119,28 +74,20 @@ def splat_rows(
         inside = op.And(op.GreaterOrEqual(target, op.Constant(value_int=0)), op.Less(target, height))
         meets = op.And(inside, op.Greater(op.Abs(radius) + one, op.Abs(offset)))
         pixels = op.Squeeze(op.NonZero(meets), [0])
-        r = op.Gather(radius, pixels)
-        first = (offset - half) / r
-        second = (offset + half) / r
-        low = op.Max(op.Min(op.Min(first, second), top), bottom)
-        high = op.Max(op.Min(op.Max(first, second), top), bottom)
-        covered = high - low
-        safe = op.Where(op.Greater(covered, tiny), covered, one)
-        integral = edge_integrals(op.Concat(low, high, axis=0), knots, integrals, slopes, strides)
-        before, after = op.Split(integral, axis=0, num_outputs=2)
-        straight = (after - before) / op.Unsqueeze(safe, [1])
-        arc = arc_integral((low - middle) / extent, (high - middle) / extent)
-        round_part = bulge * extent * arc / safe
-        left_edge = r * (op.Squeeze(op.Slice(straight, [0], [1], [1]), [1]) - round_part)
-        right_edge = r * (op.Squeeze(op.Slice(straight, [1], [2], [1]), [1]) + round_part)
-        weight = op.Where(op.Greater(covered, tiny), covered, zero) / (op.Abs(r) * whole)
-        share = op.Gather(flat, pixels, axis=1) * weight
-        base = (op.Div(pixels, width) + row) * (width + 2)
-        here = op.Gather(x, pixels)
         wide = op.Cast(width, to=DOUBLE.dtype)  # here: outside, onnxruntime warns that it cannot optimise it away
-        left = op.Max(op.Min(op.Min(left_edge, right_edge) + here, wide), zero)
-        right = op.Max(op.Min(op.Max(left_edge, right_edge) + here, wide), zero)
-        buffer = add_differences(buffer, base, left, right, share)
+        frame = op.Concat(op.Reshape(offset, [1]), op.Reshape(wide, [1]), axis=0)
+        near = op.Gather(radius, pixels)
+        owner, arc, low, high, column = row_pieces(
+            near, op.Gather(x, pixels), frame, knots, slopes, bulge, turns, keys, pieces, strides
+        )
+        r = op.Gather(near, owner)
+        owned = op.Gather(pixels, owner)
+        mean, weight = mean_edges(r, arc, low, high, knots, integrals, slopes, bulge, whole, strides)
+        kept = op.Max(column, zero)
+        within = op.And(op.GreaterOrEqual(column, zero), op.Less(column, wide))
+        part = op.Where(within, op.Min(op.Max(op.Gather(x, owned) + mean - kept, zero), one), zero)
+        index = (op.Div(owned, width) + row) * (width + 2) + op.Cast(kept, to=INT64.dtype)
+        buffer = add_differences(buffer, index, part, op.Gather(flat, owned, axis=1) * weight)
     padded = op.Concat(channels, op.Slice(shape, [0], [1]), op.Reshape(height, [1]), op.Reshape(width + 2, [1]), axis=0)
     planes = op.Transpose(op.Reshape(buffer, padded), perm=[1, 0, 2, 3])
     return op.Slice(planes, [0], op.Reshape(width, [1]), [3])
@@ -242,9 +189,12 @@ def translations():
     return {operators.splat_spans.default: splat_spans, operators.pull_push.default: pull_push}
 
 
+_CALLING = (*FUNCTIONS, add_differences, splat_rows)
+
+
 def functions():
     """Functions of standard operators that an exported file has to hold."""
-    calling = [f.to_function_proto() for f in (edge_integrals, arc_integral, add_differences, splat_rows)]
+    calling = [f.to_function_proto() for f in _CALLING]
     own = onnx.helper.make_opsetid(DOMAIN.domain, DOMAIN.version)
     calling[-1].opset_import.append(own)  # onnxscript leaves it out, as the calls stand in a loop
     return [*calling, halved.to_function_proto(), doubled.to_function_proto()]

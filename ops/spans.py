@@ -1,9 +1,8 @@
-"""Flat convex point-spread functions, row by row.
+"""Shapes of flat convex point-spread functions.
 
-A flat PSF is a convex shape, scaled by the circle of confusion and filled evenly. Each image row cuts a slab
-of height one out of it. The slab is replaced by a rectangle of the same area: from the mean left edge to the
-mean right edge over the covered part of the row, weighted by the share of the row that is covered. So the mass
-is exact for every radius, rows enter and leave with weight zero, and the ends move continuously with the CoC.
+A flat PSF is a convex shape, scaled by the circle of confusion and filled evenly: every pixel gets the share of it that
+the shape covers. So its mass is exact for every radius, and it changes continuously with the CoC. How the shape is
+taken apart into pixels stands in `torchbokeh.ops.outline`.
 """
 
 import math
@@ -78,7 +77,8 @@ def edge_slopes(knots: Tensor) -> Tensor:
 
 def piece_at(knots: Tensor, y: Tensor) -> Tensor:
     """The numbers of the knots that the heights ``y`` lie above, from 0 to K-2: of the pieces of the edges there."""
-    return (torch.searchsorted(knots[:, 0].detach().contiguous(), y.detach(), right=True) - 1).clamp(0, len(knots) - 2)
+    heights = knots[:, 0].detach().contiguous()
+    return (torch.searchsorted(heights, y.detach().contiguous(), right=True) - 1).clamp(0, len(knots) - 2)
 
 
 def knot_integrals(knots: Tensor) -> Tensor:
@@ -94,45 +94,16 @@ def area(profile: Profile) -> Tensor:
     return right - left + 0.5 * math.pi * bulge * (knots[-1, 0] - knots[0, 0])
 
 
-def row_span(coc: Tensor, row: int, profile: Profile) -> tuple[Tensor, Tensor, Tensor]:
-    """The rectangle that stands for one row of each PSF.
-
-    Args:
-        coc: ``(N,)`` signed radii in px with ``|coc| >= MIN_RADIUS``.
-        row: offset of the image row from the centre of the PSF.
-        profile: the unit shape, in the dtype of ``coc``.
-
-    Returns:
-        ``left``, ``right`` (px from the centre of the PSF) and ``weight`` (1/px²), each ``(N,)``: the row holds
-        the mass ``weight * (right - left)``, and these sum to 1 over all rows. Rows that the PSF does not reach
-        have weight 0.
-    """
+def edge_integrals(profile: Profile, y: Tensor) -> Tensor:
+    """Integrals ``(N, 2)`` of the left and the right edge from the first knot up to the heights ``y`` ``(N,)``."""
     knots, bulge = profile
+    k = piece_at(knots, y)
+    dy = (y - knots[k, 0])[:, None]
+    straight = knot_integrals(knots)[k] + dy * (knots[k, 1:] + 0.5 * edge_slopes(knots)[k] * dy)
     bottom, top = knots[0, 0], knots[-1, 0]
-    first, second = (row - 0.5) / coc, (row + 0.5) / coc
-    low = torch.minimum(first, second).clamp(bottom, top)
-    high = torch.maximum(first, second).clamp(bottom, top)
-    height = high - low
-    covered = height > 1e-12
-    safe_height = torch.where(covered, height, 1.0)
-
-    integrals, slopes = knot_integrals(knots), edge_slopes(knots)
-
-    def edge_integrals(y: Tensor) -> Tensor:
-        k = piece_at(knots, y)
-        dy = (y - knots[k, 0])[:, None]
-        return integrals[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
-
-    half = 0.5 * (top - bottom)
-    middle = 0.5 * (top + bottom)
-    linear = (edge_integrals(high) - edge_integrals(low)) / safe_height[:, None]
-    arc = _Semicircle.apply((high - middle) / half) - _Semicircle.apply((low - middle) / half)
-    round_part = bulge * half * arc / safe_height
-
-    one, other = coc * (linear[:, 0] - round_part), coc * (linear[:, 1] + round_part)
-    left, right = torch.minimum(one, other), torch.maximum(one, other)
-    weight = torch.where(covered, height, 0.0) / (coc.abs() * area(profile))
-    return left, right, weight
+    half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
+    arc = bulge * half * _Semicircle.apply((y - middle) / half)
+    return straight + torch.stack([-arc, arc], 1)
 
 
 def clamp_radius(coc: Tensor) -> Tensor:
@@ -167,8 +138,8 @@ def heights_above(profile: Profile, parts: Tensor, of: int = 1) -> Tensor:
 def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
     """Cut a shape into ``side * side`` pieces of equal area: sub-apertures, each with its own PSF.
 
-    Cuts run along rows, and from edge to edge at equal shares of each row, so every piece is again a stack of row
-    intervals and together they make up the shape. Curved edges become chains of ``samples`` chords.
+    Cuts run along rows, and across at columns, so every piece is again convex and together they make up the shape.
+    Curved edges become chains of ``samples`` chords.
 
     Args:
         profile: the whole shape.
@@ -199,7 +170,24 @@ def subdivide(profile: Profile, side: int, samples: int = 48) -> list[Profile]:
         y = torch.cat([y, inner[(inner > y[0]) & (inner < y[-1])]])
         y = y[y.detach().argsort()]
         left, right = edges_at(profile, y)
-        for column in range(side):
-            edge = (left + (right - left) * ((column + end) / side) for end in (0, 1))
+        columns = [_column_with(y, left, right, k / side) for k in range(1, side)]
+        for one, other in pairwise([left.amin(), *columns, right.amax()]):
+            edge = (t.maximum(one).minimum(other) for t in (left, right))
             pieces.append(Profile(torch.stack([y, *edge], 1), torch.zeros_like(profile.bulge)))
     return pieces
+
+
+def _column_with(y: Tensor, left: Tensor, right: Tensor, share: float) -> Tensor:
+    """The x that such a share of the area between two edges, given at the heights ``y``, is left of."""
+
+    def beside(x: Tensor) -> Tensor:
+        return torch.trapezoid(right.minimum(x) - left.minimum(x), y)
+
+    wanted = share * torch.trapezoid(right - left, y)
+    with torch.no_grad():
+        low, high = left.amin(), right.amax()
+        for _ in range(60):
+            x = 0.5 * (low + high)
+            low, high = torch.where(beside(x) < wanted, x, low), torch.where(beside(x) < wanted, high, x)
+        width = torch.trapezoid(((left < x) & (x < right)).to(x), y).clamp_min(FLAT)
+    return x - (beside(x) - wanted) / width  # hardly moves it, and lets gradients through

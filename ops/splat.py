@@ -1,6 +1,6 @@
 """Splatting: every source pixel adds its point-spread function to a buffer.
 
-Two kinds of PSFs. `splat_spans` draws flat convex shapes by the two ends of each row, exact and in closed form;
+Two kinds of PSFs. `splat_spans` draws flat convex shapes by their outline, exact and in closed form;
 `splat_points` draws tables of points, the *spreadlets* of Leimkühler et al., "Laplacian Kernel Splatting for
 Efficient Depth-of-field and Motion Blur Synthesis or Reconstruction" (2018), section 6.
 
@@ -10,22 +10,25 @@ stand behind one custom operator each, whose backward pass is the adjoint gather
 ever built.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchbokeh.ops.checks import check_flag, check_image
 from torchbokeh.ops.dispatch import compute_dtype, has_kernel, refuse_second, refuse_transforms
+from torchbokeh.ops.outline import Arcs, Pieces, arcs_of, mean_edge, row_pieces
+from torchbokeh.ops.outline_gradient import mean_edge_gradient
 from torchbokeh.ops.points import PointTable, flatten, splat_points, unflatten
-from torchbokeh.ops.span_gradient import row_span_gradient
-from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, row_span, working_dtype
+from torchbokeh.ops.spans import MIN_RADIUS, Profile, check_profile, clamp_radius, working_dtype
 
 __all__ = ["PointTable", "splat_points", "splat_spans"]
 
 
 def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: bool = False) -> Tensor:
-    """Splat flat convex PSFs as row intervals: two differences per row, for any radius.
+    """Splat flat convex PSFs by their outlines: differences where a row begins and ends, for any radius.
+
+    Every pixel gets the share of the shape that covers it, so that a disc is the same along rows and along columns.
 
     The result is the derivative along x of the blurred image; the running sum along x
     (`torchbokeh.ops.integrate.running_sum_x`) is its inverse. Intervals are cut at the image border, where the
@@ -71,38 +74,53 @@ def splat_spans(values: Tensor, coc: Tensor, profile: Profile, *, integrate: boo
     return out.to(values.dtype) if dtype != values.dtype and values.dtype.itemsize < 4 else out
 
 
-def _row_ends(coc: Tensor, row: int, profile: Profile, size: tuple[int, int]) -> Any:
-    """The interval ends of one PSF row for the pixels of flat ``(B, H, W)`` images where it can be seen.
+class _Ends(NamedTuple):
+    """What the PSFs of flat ``(B, H, W)`` images leave in one row, as differences along x.
 
-    Returns the flat indices of these pixels, then for the left and the right end the flat index of its column in a
-    ``(B, H, W+2)`` buffer, the share of the next column and whether it lies within the image, and the row's weight.
+    Attributes:
+        pieces: of their outlines, whose owners are pixels.
+        column: flat index ``(M,)`` of the column of each piece in a ``(B, H, W+2)`` buffer.
+        part: share ``(M,)`` of the next column.
+        moves: whether ``(M,)`` the piece lies within the image.
+        weight: ``(M,)``, positive for the left end of a row.
     """
+
+    pieces: Pieces
+    column: Tensor
+    part: Tensor
+    moves: Tensor
+    weight: Tensor
+
+
+def _row_ends(coc: Tensor, row: int, profile: Profile, arcs: Arcs, size: tuple[int, int]) -> _Ends:
+    """The differences of one row of the PSFs of all pixels of flat ``(B, H, W)`` images where it can be seen."""
     h, w = size
     where = torch.arange(len(coc), device=coc.device)
     y = where // w % h
     pixels = where[(y + row >= 0) & (y + row < h) & (coc.abs() + 1 > abs(row))]
-    left, right, weight = row_span(coc[pixels], row, profile)
-    base = (pixels // w + row) * (w + 2)
-    ends = []
-    for end in (left, right):
-        u = end + (pixels % w + 0.5)
-        column = u.clamp(0, w).floor()
-        ends.append((base + column.long(), u.clamp(0, w) - column, (u > 0) & (u < w)))
-    return pixels, *ends, weight
+    pieces = row_pieces(coc[pixels], pixels % w + 0.5, row, profile, arcs, w)
+    pieces = pieces._replace(owner=pixels[pieces.owner])
+    radius, x = coc[pieces.owner], pieces.owner % w + 0.5
+    mean, weight = mean_edge(radius, pieces, profile)
+    column = pieces.column.clamp_min(0)
+    moves = (pieces.column >= 0) & (pieces.column < w)
+    part = torch.where(moves, (x + mean - column).clamp(0, 1), 0.0)
+    left = (pieces.arc < 2) == (radius > 0)
+    column = (pieces.owner // w + row) * (w + 2) + column.long()
+    return _Ends(pieces, column, part, moves, torch.where(left, weight, -weight))
 
 
 def _splat_spans_torch(values: Tensor, coc: Tensor, profile: Profile, integrate: bool) -> Tensor:
     b, c, h, w = values.shape
     work = working_dtype(values.device)
     flat = flatten(values).to(work)
-    radius = clamp_radius(coc.reshape(-1).to(work))
+    radius, arcs = clamp_radius(coc.reshape(-1).to(work)), arcs_of(profile)
     out = torch.zeros(c, b * h * (w + 2), dtype=work, device=values.device)
     for row in _rows(radius, h):
-        pixels, left, right, weight = _row_ends(radius, row, profile, (h, w))
-        share = flat.index_select(1, pixels) * weight
-        for (column, part, _), signed in ((left, share), (right, -share)):
-            out.index_add_(1, column, signed * (1 - part))
-            out.index_add_(1, column + 1, signed * part)
+        ends = _row_ends(radius, row, profile, arcs, (h, w))
+        share = flat.index_select(1, ends.pieces.owner) * ends.weight
+        out.index_add_(1, ends.column, share * (1 - ends.part))
+        out.index_add_(1, ends.column + 1, share * ends.part)
     out = out.reshape(c, b, h, w + 2)[..., :w].movedim(0, 1)
     return (out.cumsum(-1) if integrate else out).to(values.dtype).contiguous()
 
@@ -118,27 +136,28 @@ def _rows(radius: Tensor, height: int) -> range:
 def _gather_spans_torch(grad: Tensor, values: Tensor, coc: Tensor, profile: Profile) -> list[Tensor]:
     """Gradients of ``values, coc, knots, bulge``; ``grad`` is that of the differences.
 
-    The splat is linear in the buffer, so its backward pass is the gradient of
-    ``sum(value * weight * (g(left) - g(right)))`` with ``g`` the incoming gradient, interpolated linearly.
+    The splat is linear in the buffer, so its backward pass is the gradient of ``sum(value * weight * g(end))`` over the
+    pieces of all outlines, with ``g`` the incoming gradient, interpolated linearly.
     """
     h, w = values.shape[2:]
     work = working_dtype(values.device)
     g = flatten(torch.nn.functional.pad(grad.to(work), (0, 2)))
     flat = flatten(values).to(work)
-    radius = clamp_radius(coc.reshape(-1).to(work))
+    radius, arcs = clamp_radius(coc.reshape(-1).to(work)), arcs_of(profile)
     by_values, by_coc = torch.zeros_like(flat), torch.zeros_like(radius)
     by_knots, by_bulge = torch.zeros_like(profile.knots), torch.zeros_like(profile.bulge)
     for row in _rows(radius, h):
-        pixels, left, right, weight = _row_ends(radius, row, profile, (h, w))
-        value = flat.index_select(1, pixels)
-        mass, by_end = torch.zeros_like(value), {}
-        for (column, part, moves), sign in ((left, 1), (right, -1)):
-            here, slope = g.index_select(1, column), g.index_select(1, column + 1) - g.index_select(1, column)
-            mass += sign * (here + part * slope)
-            by_end[sign] = sign * moves * weight * (value * slope).sum(0)
-        by_values.index_add_(1, pixels, weight * mass)
-        by_row = row_span_gradient(radius[pixels], row, profile, by_end[1], by_end[-1], (value * mass).sum(0))
-        by_coc.index_add_(0, pixels, by_row[0])
+        ends = _row_ends(radius, row, profile, arcs, (h, w))
+        owner = ends.pieces.owner
+        value = flat.index_select(1, owner)
+        here = g.index_select(1, ends.column)
+        slope = g.index_select(1, ends.column + 1) - here
+        here = here + ends.part * slope
+        by_values.index_add_(1, owner, ends.weight * here)
+        by_mean = ends.moves * ends.weight * (value * slope).sum(0)
+        by_weight = ends.weight.sign() * (value * here).sum(0)
+        by_row = mean_edge_gradient(radius[owner], ends.pieces, profile, by_mean, by_weight)
+        by_coc.index_add_(0, owner, by_row[0])
         by_knots += by_row[1]
         by_bulge += by_row[2]
     by_coc = by_coc.reshape(coc.shape) * (coc.abs() > MIN_RADIUS)

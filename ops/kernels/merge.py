@@ -20,18 +20,21 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge_collect import BAND, RECORD, Lanes, Levels, Picture, bands, classify, collect
-from torchbokeh.ops.kernels.radius_bank import (
-    RadiusBank,
-    draw_psf,
-    number_of,
-    psf_buffer,
-    radius_bank,
-    rounded,
-    rows_within,
+from torchbokeh.ops.kernels.merge_collect import (
+    BAND,
+    RECORD,
+    Lanes,
+    Levels,
+    Picture,
+    Shares,
+    bands,
+    classify,
+    collect,
+    row_shares,
 )
-from torchbokeh.ops.kernels.rows import draw_rows, running_sum
-from torchbokeh.ops.kernels.splat import clamped, row_range, shape_of
+from torchbokeh.ops.kernels.outline import at_rows, clamped, draw_arc, psf_buffer, psf_room, rows_to_draw, shape_of
+from torchbokeh.ops.kernels.radius_bank import RadiusBank, number_of, radius_bank, rounded
+from torchbokeh.ops.kernels.rows import draw_points, rows_above, rows_within, running_sum
 from torchbokeh.ops.merge import FADE, MARGIN, SPREAD, Merging
 from torchbokeh.ops.spans import MIN_RADIUS, Profile
 from torchbokeh.ops.system.threads import run_all, stage
@@ -52,28 +55,42 @@ class Band(NamedTuple):
 class Row(NamedTuple):
     """What a row of ``W`` pixels holds on the lowest level.
 
-    Beside what `classify` fills in, and ``energy (W,)`` as scratch: the interleaved ``pixels (4 W,)``, and
+    Beside the ``shares`` of `classify`, and ``energy (W,)`` as scratch: the interleaved ``pixels (4 W,)``, and
     ``numbers (W,)`` of PSFs in the bank, -1 for a pixel that has nothing there.
     """
 
-    levels: np.ndarray
-    shares: np.ndarray
+    shares: Shares
     energy: np.ndarray
     pixels: np.ndarray
     numbers: np.ndarray
 
 
+@nb.njit(inline="always")
+def wide_psfs(shape, n, columns):  # type: ignore[no-untyped-def]
+    """A shape, and room for PSFs of it that are not in the bank: ``starts``, ``points``, and all as `psf_room`."""
+    buffer = psf_buffer(n, columns)
+    return shape, buffer.starts, buffer.points, psf_room(shape, buffer)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _draw_wide(band, pad, src, p, x, y, coc, buffer):  # type: ignore[no-untyped-def]
-    """Add one PSF that is not in the bank, centred on the cell ``(x, y)``."""
-    sums, stride, y0, y1 = band
-    shapes, c = buffer.shape.tables, clamped(coc)
-    s = 1 if c < 0.0 else 0
-    first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], y0, y1)
+def _draw_wide(band, pad, src, p, x, y, coc, wide):  # type: ignore[no-untyped-def]
+    """Add one PSF that is not in the bank, centred on the cell ``(x, y)``; ``wide`` is from `wide_psfs`."""
+    (sums, stride, y0, y1), (shape, starts, points, room) = band, wide
+    c = clamped(coc)
+    first, n = rows_to_draw(c, y, y0, y1, shape.ends, shape.level)
     if n > 0:
-        borders = (0.0, np.float64((stride >> 2) - 2 * pad))
-        draw_psf(c, x + 0.5, first, n, borders, buffer)
-        draw_rows(sums, (y + first - y0) * stride + 4 * pad, stride, src, p, buffer.rows, (0, n))
+        at_rows(c, (first, n), room)
+        for arc in range(2 if shape.even else 0, 4):
+            k, m = draw_arc(arc, c, (x, first, n), (0, (stride >> 2) - 2 * pad), room, False)
+            k += first
+            if m > 0:
+                i, j = rows_within(y + k, m, y0, y1)
+                o = (y + k - y0) * stride + 4 * pad
+                draw_points(sums, (o, -1), stride, (src, p), points, (starts[i], starts[j]), shape.even)
+                if shape.level:
+                    i, j = rows_above(k, y, m, y0, y1)
+                    o = (y - k - y0) * stride + 4 * pad
+                    draw_points(sums, (o, -1), -stride, (src, p), points, (starts[i], starts[j]), shape.even)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -122,12 +139,13 @@ def finish_row(band, pad, coarse, y, margin, scratch, row):  # type: ignore[no-u
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyped-def]
     """A band of a level above the lowest: ``out (rows + 2*MARGIN, columns + 2*MARGIN, 4)``."""
-    shape, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, starts, points = bank
+    even, level_shape = shape.even, shape.level
     sums, stride, y0, y1 = band
     cells, reach = levels.cells, levels.reach[level]
-    rows, across, start = levels.sizes[level, 0], levels.sizes[level, 1], levels.sizes[level, 2]
+    rows, across, first_cell = levels.sizes[level, 0], levels.sizes[level, 1], levels.sizes[level, 2]
     sums[: (y1 - y0) * stride] = 0.0
-    buffer = psf_buffer(shape, BAND)
+    wide = wide_psfs(shape, BAND, (stride >> 2) - 2 * pad)
     scale = 1.0 / (1 << level)
     in_bank = mirrored if mirrored else len(firsts)
     for j in range(rows):
@@ -135,7 +153,7 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
         r = reach[j] * scale
         if r == 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
-        p = RECORD * (start + j * across)
+        p = RECORD * (first_cell + j * across)
         for i in range(across):
             if cells[p] != 0.0 or cells[p + 1] != 0.0 or cells[p + 2] != 0.0 or cells[p + 3] != 0.0:
                 radius = cell_radius(cells, p, scale)
@@ -144,12 +162,24 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
                     k = int(number)
                     if cells[p + 6] < 0.0:
                         k += mirrored
-                    first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
-                    o = (first - y0) * stride + 4 * (pad + MARGIN + i)
-                    draw_rows(sums, o, stride, cells, p, bank_rows, span)
+                    first, begin = firsts[k], ends[k]
+                    n, o = ends[k + 1] - 1 - begin, (y - y0) * stride + 4 * (pad + MARGIN + i)
+                    if level_shape and y - n >= y0 and y + n <= y1:
+                        span = starts[begin], starts[begin + 1]
+                        draw_points(sums, (o, -1), stride, (cells, p), points, span, even)
+                        span = starts[begin + 1], starts[begin + n]
+                        draw_points(sums, (o, o), stride, (cells, p), points, span, even)
+                    else:
+                        u, v = rows_within(y + first, n, y0, y1)
+                        span = starts[begin + u], starts[begin + v]
+                        draw_points(sums, (o + first * stride, -1), stride, (cells, p), points, span, even)
+                        if level_shape:
+                            u, v = rows_above(first, y, n, y0, y1)
+                            span = starts[begin + u], starts[begin + v]
+                            draw_points(sums, (o - first * stride, -1), -stride, (cells, p), points, span, even)
                 else:
                     coc = rounded(math.copysign(radius, cells[p + 6]))
-                    _draw_wide(band, pad, cells, p, i + MARGIN, y, coc, buffer)
+                    _draw_wide(band, pad, cells, p, i + MARGIN, y, coc, wide)
             p += RECORD
     scratch = interpolation_rows(coarse, out.shape[1])
     for y in range(y0, y1):
@@ -160,11 +190,11 @@ def _cell_band(levels, level, bank, coarse, out, band):  # type: ignore[no-untyp
 def _lowest(picture, lanes, y, in_bank, row):  # type: ignore[no-untyped-def]
     """Fill ``row`` from row ``y`` of the picture, once `classify` has filled its levels and shares."""
     values, coc, weight = picture
-    levels, shares, energy, pixels, numbers = row
+    (levels, shares, lit), energy, pixels, numbers = row
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(levels)):
         level = levels[x]
-        shares[x] = one if level == zero else (one - shares[x] if level == one else zero)
+        shares[x] = one if level == zero else ((one - shares[x]) * (one - lit[x]) if level == one else zero)
         energy[x] = zero
     if weight.shape[0] > 0:
         weights = weight[y]
@@ -194,21 +224,21 @@ def _lowest(picture, lanes, y, in_bank, row):  # type: ignore[no-untyped-def]
 def draw_pixels(picture, lanes, levels, bank, band):  # type: ignore[no-untyped-def]
     """Draw the lowest level and the highlights into a band."""
     values, coc, weight = picture
-    shape, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, starts, points = bank
+    even, level_shape = shape.even, shape.level
     sums, stride, y0, y1 = band
     height, width = coc.shape
     sums[: (y1 - y0) * stride] = 0.0
-    buffer = psf_buffer(shape, BAND)
+    wide = wide_psfs(shape, BAND, (stride >> 2) - 2 * pad)
     in_bank = mirrored if mirrored else len(firsts)
-    kinds, rest, energy = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     pixels, numbers = np.empty(4 * width, np.float32), np.empty(width, np.int32)
-    row = Row(kinds, rest, energy, pixels, numbers)
+    row = Row(row_shares(width), np.empty(width, np.float32), pixels, numbers)
     reach = levels.reach[0]
     for y in range(height):
         r = reach[y]
         if r < 0.0 or y + r + 1.0 < y0 or y - r > y1:
             continue
-        begin, end = classify(picture, levels.thresholds, y, kinds, rest)
+        begin, end = classify(picture, levels.thresholds, y, row.shares)
         _lowest(picture, lanes, y, in_bank, row)
         for x in range(begin, end):
             p = 4 * x
@@ -218,17 +248,30 @@ def draw_pixels(picture, lanes, levels, bank, band):  # type: ignore[no-untyped-
             if k < in_bank:
                 if coc[y, x] < 0.0:
                     k += mirrored
-                first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], y0, y1)
-                draw_rows(sums, (first - y0) * stride + 4 * (pad + x), stride, pixels, p, bank_rows, span)
+                first, start = firsts[k], ends[k]
+                n, o = ends[k + 1] - 1 - start, (y - y0) * stride + 4 * (pad + x)
+                if level_shape and y - n >= y0 and y + n <= y1:
+                    span = starts[start], starts[start + 1]
+                    draw_points(sums, (o, -1), stride, (pixels, p), points, span, even)
+                    span = starts[start + 1], starts[start + n]
+                    draw_points(sums, (o, o), stride, (pixels, p), points, span, even)
+                    continue
+                u, v = rows_within(y + first, n, y0, y1)
+                span = starts[start + u], starts[start + v]
+                draw_points(sums, (o + first * stride, -1), stride, (pixels, p), points, span, even)
+                if level_shape:
+                    u, v = rows_above(first, y, n, y0, y1)
+                    span = starts[start + u], starts[start + v]
+                    draw_points(sums, (o - first * stride, -1), -stride, (pixels, p), points, span, even)
             else:
-                _draw_wide(band, pad, pixels, p, x, y, rounded(np.float64(coc[y, x])), buffer)
-    for mark in levels.marks:
+                _draw_wide(band, pad, pixels, p, x, y, rounded(np.float64(coc[y, x])), wide)
+    for mark, lit in zip(levels.marks, levels.lit):  # noqa: B905 (numba knows no `strict`)
         y, x = mark // width, mark % width
         for k in range(4):
-            pixels[k] = values[lanes.channel[k], y, x] if lanes.channel[k] >= 0 else lanes.constant[k]
+            pixels[k] = lit * (values[lanes.channel[k], y, x] if lanes.channel[k] >= 0 else lanes.constant[k])
             if weight.shape[0] > 0:
                 pixels[k] *= weight[y, x]
-        _draw_wide(band, pad, pixels, 0, x, y, rounded(np.float64(coc[y, x])), buffer)
+        _draw_wide(band, pad, pixels, 0, x, y, rounded(np.float64(coc[y, x])), wide)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
 from torchbokeh.ops.highlights import LEAST_CONTRAST
-from torchbokeh.ops.merge import FADE, Merging
+from torchbokeh.ops.merge import FADE, LIT, Merging
 from torchbokeh.ops.system.threads import row_bands, run_all
 
 BAND = 64
@@ -17,6 +17,9 @@ BAND = 64
 
 RECORD = 8
 """Floats of a cell: four channels, then the sums of share, of share times radius and of share times signed CoC."""
+
+
+TINIEST = np.finfo(np.float32).tiny
 
 
 class Picture(NamedTuple):
@@ -71,6 +74,7 @@ class Levels(NamedTuple):
         cells: flat records of all cells, see `RECORD`.
         reach: ``(L+1, H)`` largest radius in px in each row of a level; on the lowest, of what is no highlight.
         marks: flat indices of the highlights.
+        lit: ``(M,)`` share of each of these in what is a highlight; the rest is merged.
     """
 
     thresholds: Thresholds
@@ -78,6 +82,27 @@ class Levels(NamedTuple):
     cells: np.ndarray
     reach: np.ndarray
     marks: np.ndarray
+    lit: np.ndarray
+
+
+class Shares(NamedTuple):
+    """Where the pixels of a row belong, as rows ``(W,)`` of float32, so that many can be worked on at a time.
+
+    Attributes:
+        level: the level; -2 for a pixel without weight.
+        share: of the pixel there; the rest belongs to the level below.
+        lit: how far it is a highlight, which is drawn apart from all levels.
+    """
+
+    level: np.ndarray
+    share: np.ndarray
+    lit: np.ndarray
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def row_shares(width):  # type: ignore[no-untyped-def]
+    """Room for the `Shares` of a row."""
+    return Shares(np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32))
 
 
 @nb.njit(cache=True, nogil=True, fastmath=True)
@@ -89,21 +114,19 @@ def _largest(row):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def classify(picture, thresholds, y, level, share):  # type: ignore[no-untyped-def]
-    """Level of every pixel of row ``y`` and its share there; the rest belongs to the level below.
-
-    -1 stands for a highlight, -2 for a pixel without weight. ``level`` and ``share`` are float32 rows, so that the
-    compiler can work on many pixels at a time. Returns the columns between which pixels have weight.
-    """
-    values, coc, weight = picture
+def classify(picture, thresholds, y, shares):  # type: ignore[no-untyped-def]
+    """Fill the `Shares` of row ``y``. Returns the columns between which pixels have weight."""
+    (values, coc, weight), (level, share, lit) = picture, shares
     merging, highest, means = thresholds
     finest, highlight = np.float32(merging.cells), np.float32(merging.highlight)
-    one, zero, least = np.float32(1.0), np.float32(0.0), np.float32(LEAST_CONTRAST)
+    one, zero, least, tiny = np.float32(1.0), np.float32(0.0), np.float32(LEAST_CONTRAST), TINIEST
+    start, slope = np.float32(LIT), np.float32(1.0 / (1.0 - LIT))
     row = coc[y]
     top = _largest(row)
     begin, end = 0, len(row)
     level[:] = zero
     share[:] = one
+    lit[:] = zero
     if weight.shape[0] > 0:
         weights = weight[y]
         for x in range(len(row)):
@@ -126,8 +149,9 @@ def classify(picture, thresholds, y, level, share):  # type: ignore[no-untyped-d
     for k in range(values.shape[0]):
         plane, mean = values[k, y], means[k]
         for x in range(len(row)):
-            high = (level[x] > zero) & (abs(plane[x]) > mean * max(highlight * row[x] * row[x], least))
-            level[x] = -one if high else level[x]
+            bound = max(mean * max(highlight * row[x] * row[x], least), tiny)
+            high = min((abs(plane[x]) / bound - start) * slope, one)
+            lit[x] = high if (level[x] > zero) & (high > lit[x]) else lit[x]
     return begin, end
 
 
@@ -145,17 +169,17 @@ def _add(cells, p, lanes, w, r, signed):  # type: ignore[no-untyped-def]
 def _collect_row(picture, lanes, levels, y, starts, row, farthest, marks):  # type: ignore[no-untyped-def]
     """Sum the pixels of row ``y`` into the cells of their levels, whose rows begin at ``starts (L+1,)``.
 
-    ``row`` is scratch of `classify`. ``farthest (L+1,)`` takes the largest radius of each level, and ``marks (W,)`` the
-    flat indices of the highlights, whose number is returned. Sums are kept in registers as long as neighbours go to
-    the same cell.
+    ``row`` is scratch of `classify`. ``farthest (L+1,)`` takes the largest radius of each level, and ``marks``, two
+    rows ``(W,)``, the flat indices of the highlights and their shares; their number is returned. Sums are kept in
+    registers as long as neighbours go to the same cell.
     """
     values, coc, weight = picture
-    cells, (numbers, shares) = levels.cells, row
+    cells, (numbers, shares, lit), (indices, highs) = levels.cells, row, marks
     c0, c1, c2, c3 = lanes.channel[0], lanes.channel[1], lanes.channel[2], lanes.channel[3]
     a, b, c, d = lanes.constant[0], lanes.constant[1], lanes.constant[2], lanes.constant[3]
     zero, one = np.float32(0.0), np.float32(1.0)
     weighted, width = weight.shape[0] > 0, coc.shape[1]
-    begin, end = classify(picture, levels.thresholds, y, numbers, shares)
+    begin, end = classify(picture, levels.thresholds, y, row)
     count, current = 0, -1
     s0 = s1 = s2 = s3 = sw = sr = ss = zero
     for x in range(begin, end):
@@ -165,10 +189,12 @@ def _collect_row(picture, lanes, levels, y, starts, row, farthest, marks):  # ty
         if level <= 0:
             if level == 0:
                 farthest[0] = max(farthest[0], r)
-            elif level == -1:
-                marks[count] = y * width + x
-                count += 1
             continue
+        if lit[x] > zero:
+            indices[count], highs[count] = y * width + x, lit[x]
+            count += 1
+            if lit[x] >= one:
+                continue
         if c0 >= 0:
             a = values[c0, y, x]
         if c1 >= 0:
@@ -183,7 +209,7 @@ def _collect_row(picture, lanes, levels, y, starts, row, farthest, marks):  # ty
                 _add(cells, current, (s0, s1, s2, s3), sw, sr, ss)
             current = p
             s0 = s1 = s2 = s3 = sw = sr = ss = zero
-        whole = weight[y, x] if weighted else one
+        whole = (weight[y, x] if weighted else one) * (one - lit[x])
         w = shares[x] * whole
         s0 += w * a
         s1 += w * b
@@ -209,7 +235,8 @@ def _collect_row(picture, lanes, levels, y, starts, row, farthest, marks):  # ty
 def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-untyped-def]
     """Sum the pixels of rows ``y0 .. y1-1`` into the cells of their levels.
 
-    ``marks (H, W)`` takes the flat indices of the highlights of each row, ``counts (H,)`` how many there are.
+    ``marks``, two arrays ``(H, W)``, take the flat indices of the highlights of each row and their shares, and
+    ``counts (H,)`` how many there are.
     """
     sizes, cells, reach = levels.sizes, levels.cells, levels.reach
     highest, width = levels.thresholds.highest, picture.coc.shape[1]
@@ -218,7 +245,7 @@ def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-
         first, last = y0 >> level, (y1 - 1) >> level
         cells[RECORD * (start + first * columns) : RECORD * (start + (last + 1) * columns)] = 0.0
         reach[level, first : last + 1] = 0.0
-    row = np.empty(width, np.float32), np.empty(width, np.float32)
+    row = row_shares(width)
     farthest = np.zeros(highest + 1, np.float32)
     starts = np.empty(highest + 1, np.int64)
     for y in range(y0, y1):
@@ -226,7 +253,7 @@ def _collect(picture, lanes, levels, marks, counts, y0, y1):  # type: ignore[no-
             starts[level] = sizes[level, 2] + (y >> level) * sizes[level, 1]
         farthest[:] = 0.0
         farthest[0] = -1.0
-        counts[y] = _collect_row(picture, lanes, levels, y, starts, row, farthest, marks[y])
+        counts[y] = _collect_row(picture, lanes, levels, y, starts, row, farthest, (marks[0][y], marks[1][y]))
         reach[0, y] = farthest[0]
         for level in range(1, highest + 1):
             reach[level, y >> level] = max(reach[level, y >> level], farthest[level])
@@ -270,12 +297,14 @@ def collect(picture: Picture, lanes: Lanes, merging: Merging, highest: int) -> L
         count += sizes[level, 0] * sizes[level, 1]
     cells = np.empty(RECORD * count, np.float32)
     reach = np.empty((highest + 1, height), np.float64)
-    marks, counts = np.empty((height, width), np.int64), np.empty(height, np.int64)
-    levels = Levels(thresholds, sizes, cells, reach, np.empty(0, np.int64))
+    marks = np.empty((height, width), np.int32), np.empty((height, width), np.float32)
+    counts = np.empty(height, np.int64)
+    levels = Levels(thresholds, sizes, cells, reach, np.empty(0, np.int64), np.empty(0, np.float32))
     work = partial(_collect, picture, lanes, levels, marks, counts)
     run_all(work, row_bands(height, max(1 << highest, BAND // 2)), "collect")  # no cell lies in two of them
-    found = [marks[y, : counts[y]] for y in np.flatnonzero(counts)]
-    return levels._replace(marks=np.concatenate([levels.marks, *found]))
+    used = np.flatnonzero(counts)
+    indices, lit = (np.concatenate([t[:0, 0], *(t[y, : counts[y]] for y in used)]) for t in marks)
+    return levels._replace(marks=indices, lit=lit)
 
 
 def bands(height: int) -> list[tuple[int, int]]:

@@ -14,19 +14,11 @@ import torch
 from torch import Tensor
 
 from torchbokeh.ops.composite import TINY
-from torchbokeh.ops.kernels.merge import bank_for, cell_radius
-from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, bands, classify, collect
-from torchbokeh.ops.kernels.radius_bank import (
-    RadiusBank,
-    draw_psf,
-    draw_slopes,
-    number_of,
-    psf_buffer,
-    rounded,
-    rows_within,
-)
-from torchbokeh.ops.kernels.rows import gather_rows
-from torchbokeh.ops.kernels.splat import clamped, row_range
+from torchbokeh.ops.kernels.merge import bank_for, cell_radius, wide_psfs
+from torchbokeh.ops.kernels.merge_collect import RECORD, Lanes, Levels, Picture, bands, classify, collect, row_shares
+from torchbokeh.ops.kernels.outline import at_rows, clamped, draw_arc, rows_to_draw
+from torchbokeh.ops.kernels.radius_bank import RadiusBank, number_of, rounded
+from torchbokeh.ops.kernels.rows import gather_points, rows_above, rows_within
 from torchbokeh.ops.merge import MARGIN, Merging
 from torchbokeh.ops.spans import Profile
 from torchbokeh.ops.system.threads import run_all
@@ -111,16 +103,24 @@ def _down(fine, margin, coarse, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _gather_wide(sums, pad, x, y, coc, buffer, found):  # type: ignore[no-untyped-def]
-    """`gather_rows` for a PSF that is not in the bank, centred on the cell ``(x, y)``."""
-    shapes, c = buffer.shape.tables, clamped(coc)
-    s = 1 if c < 0.0 else 0
-    first, n = row_range(abs(c), y, shapes[s, 0, 0], shapes[s, -1, 0], 0, sums.shape[0])
-    n, borders = max(n, 0), (0.0, np.float64(sums.shape[1] - 2 * pad))
-    draw_psf(c, x + 0.5, first, n, borders, buffer)
-    draw_slopes(c, x + 0.5, first, n, borders, buffer)
-    stride = 4 * sums.shape[1]
-    gather_rows(sums, (y + first) * stride + 4 * pad, stride, buffer.rows, (0, n), found)
+def _gather_wide(sums, pad, x, y, coc, wide, found):  # type: ignore[no-untyped-def]
+    """`gather_kept` for a PSF that is not in the bank, centred on the cell ``(x, y)``."""
+    (shape, starts, points, room), (height, width), c = wide, sums.shape[:2], clamped(coc)
+    first, n = rows_to_draw(c, y, 0, height, shape.ends, shape.level)
+    n = max(n, 0)
+    found[:] = 0.0
+    at_rows(c, (first, n), room)
+    for arc in range(2 if shape.even else 0, 4):
+        k, m = draw_arc(arc, c, (x, first, n), (0, width - 2 * pad), room, True)
+        k += first
+        if m > 0:
+            i, j = rows_within(y + k, m, 0, height)
+            stride, o = 4 * width, 4 * ((y + k) * width + pad)
+            gather_points(sums, o, stride, points, (starts[i], starts[j]), shape.even, found)
+            if shape.level:
+                i, j = rows_above(k, y, m, 0, height)
+                o = 4 * ((y - k) * width + pad)
+                gather_points(sums, o, -stride, points, (starts[i], starts[j]), shape.even, found)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -129,17 +129,18 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
 
     ``sums (H, W + 2 pad, 4)`` is the gradient of the differences of the level.
     """
-    shape, mirrored, pad, firsts, ends, bank_rows = bank
-    cells, across, start = levels.cells, levels.sizes[level, 1], levels.sizes[level, 2]
+    shape, mirrored, pad, firsts, ends, starts, points = bank
+    even, level_shape = shape.even, shape.level
+    cells, across, first_cell = levels.cells, levels.sizes[level, 1], levels.sizes[level, 2]
     in_bank = mirrored if mirrored else len(firsts)
     height, stride = sums.shape[0], 4 * sums.shape[1]
-    buffer = psf_buffer(shape, height)
+    wide = wide_psfs(shape, height, sums.shape[1] - 2 * pad)
     scale = 1.0 / (1 << level)
     found = np.empty(8, np.float64)
     for j in range(y0, y1):
         y = j + MARGIN
         for i in range(across):
-            p = RECORD * (start + j * across + i)
+            p = RECORD * (first_cell + j * across + i)
             if cells[p + 4] == 0.0:
                 continue
             smaller = cell_radius(cells, p, scale)
@@ -148,11 +149,16 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
                 k = int(number)
                 if cells[p + 6] < 0.0:
                     k += mirrored
-                first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
-                gather_rows(sums, first * stride + 4 * (pad + MARGIN + i), stride, bank_rows, span, found)
+                first, begin = firsts[k], ends[k]
+                n, o = ends[k + 1] - 1 - begin, 4 * (pad + MARGIN + i)
+                found[:] = 0.0
+                for up in range(2 if level_shape else 1):
+                    u, v = rows_above(first, y, n, 0, height) if up else rows_within(y + first, n, 0, height)
+                    span, at = (starts[begin + u], starts[begin + v]), y - first if up else y + first
+                    gather_points(sums, at * stride + o, -stride if up else stride, points, span, even, found)
             else:
                 coc = rounded(math.copysign(smaller, cells[p + 6]))
-                _gather_wide(sums, pad, i + MARGIN, y, coc, buffer, found)
+                _gather_wide(sums, pad, i + MARGIN, y, coc, wide, found)
             slope = 0.0
             for k in range(4):
                 grads[p + k] = found[k]
@@ -162,11 +168,12 @@ def _gather_cells(levels, level, sums, bank, grads, y0, y1):  # type: ignore[no-
 
 
 @nb.njit(inline="always")
-def _lowest_share(level, share):  # type: ignore[no-untyped-def]
-    """What a pixel has on the lowest level, from what `classify` says of it."""
-    if level == 1:
-        return np.float32(1.0) - share
-    return np.float32(1.0 if level == 0 or level == -1 else 0.0)
+def _lowest_share(level, share, lit):  # type: ignore[no-untyped-def]
+    """What a pixel has on the lowest level and as a highlight, from what `classify` says of it."""
+    one = np.float32(1.0)
+    if level <= 0:
+        return np.float32(1.0 if level == 0 else 0.0)
+    return lit + (one - lit) * (one - share) if level == 1 else lit
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -181,38 +188,44 @@ def _gather_pixels(picture, lanes, levels, sums, bank, grads, y0, y1):  # type: 
     grad_values, grad_coc, grad_weight = grads
     channel, constant = lanes.channel, lanes.constant
     thresholds, sizes, cells = levels.thresholds, levels.sizes, levels.cells
-    shape, mirrored, pad, firsts, ends, bank_rows = bank
+    shape, mirrored, pad, firsts, ends, starts, points = bank
+    even, level_shape = shape.even, shape.level
     in_bank = mirrored if mirrored else len(firsts)
     height, width = coc.shape
     stride = 4 * sums.shape[1]
-    buffer = psf_buffer(shape, height)
-    numbers, shares = np.empty(width, np.float32), np.empty(width, np.float32)
-    found = np.empty(8, np.float64)
-    grad = np.empty(5, np.float64)
+    wide = wide_psfs(shape, height, sums.shape[1] - 2 * pad)
+    row = row_shares(width)
+    numbers, shares, lit = row
+    found, grad = np.empty(8, np.float64), np.empty(5, np.float64)
     for y in range(y0, y1):
-        classify(picture, thresholds, y, numbers, shares)
+        classify(picture, thresholds, y, row)
         for x in range(width):
-            level, share = int(numbers[x]), shares[x]
+            level, share, merged = int(numbers[x]), shares[x], np.float32(1.0) - lit[x]
             signed = np.float64(coc[y, x])
             whole = weight[y, x] if weight.shape[0] > 0 else np.float32(1.0)
             grad[:] = 0.0
-            for here, w in ((level, share), (level - 1, np.float32(1.0) - share)):
+            for here, w in ((level, merged * share), (level - 1, merged * (np.float32(1.0) - share))):
                 if here > 0 and w > 0.0:
                     p = RECORD * (sizes[here, 2] + (y >> here) * sizes[here, 1] + (x >> here))
                     for k in range(4):
                         grad[k] += w * cells[p + k]
                     grad[4] += w * whole * cells[p + 4]
-            lowest = _lowest_share(level, share)
+            lowest = _lowest_share(level, share, lit[x])
             if lowest > 0.0:
                 number = number_of(abs(signed))
                 if number < in_bank:
                     k = int(number)
                     if signed < 0.0:
                         k += mirrored
-                    first, span = rows_within(y + firsts[k], ends[k], ends[k + 1], 0, height)
-                    gather_rows(sums, first * stride + 4 * (pad + x), stride, bank_rows, span, found)
+                    first, begin = firsts[k], ends[k]
+                    n, o = ends[k + 1] - 1 - begin, 4 * (pad + x)
+                    found[:] = 0.0
+                    for up in range(2 if level_shape else 1):
+                        u, v = rows_above(first, y, n, 0, height) if up else rows_within(y + first, n, 0, height)
+                        span, at = (starts[begin + u], starts[begin + v]), y - first if up else y + first
+                        gather_points(sums, at * stride + o, -stride if up else stride, points, span, even, found)
                 else:
-                    _gather_wide(sums, pad, x, y, rounded(signed), buffer, found)
+                    _gather_wide(sums, pad, x, y, rounded(signed), wide, found)
                 moves = number > 0.0
                 for k in range(4):
                     grad[k] += lowest * found[k]

@@ -1,4 +1,4 @@
-"""Flat convex PSFs as short lists of points, for kernels that draw many of the same radii: four weights per row."""
+"""Flat convex PSFs as short lists of points, for kernels that draw many of the same radii."""
 
 import math
 from typing import NamedTuple
@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from torchbokeh.ops.kernels.rows import PsfRows
-from torchbokeh.ops.kernels.splat import Shape, row_slopes, row_table
+from torchbokeh.ops.kernels.outline import Shape, at_rows, draw_arc, most_points, psf_buffer, psf_room
+from torchbokeh.ops.kernels.rows import PsfPoints
 from torchbokeh.ops.merge import EVEN, ROUNDED_TO, STEPS
 from torchbokeh.ops.spans import MIN_RADIUS
 
@@ -20,7 +20,9 @@ ROOT = EVEN**0.5
 class RadiusBank(NamedTuple):
     """PSFs of the radii ``radius_of(0), radius_of(1), ...``, first for positive CoC, then for negative.
 
-    PSF ``k`` has the rows ``ends[k] .. ends[k+1]-1``, from row ``firsts[k]`` relative to its centre.
+    PSF ``k`` starts in row ``firsts[k]`` relative to its centre; that of a level shape in its centre: the rows above it
+    are left out. Its rows have the numbers ``ends[k] .. ends[k+1]-2``, and row j the points
+    ``starts[j] .. starts[j+1]-1``.
 
     Attributes:
         shape: what PSFs of other radii are drawn from.
@@ -28,7 +30,8 @@ class RadiusBank(NamedTuple):
         reach: columns left and right of a centre that any PSF stays within.
         firsts: ``(N,)``.
         ends: ``(N+1,)``.
-        rows: those of all PSFs, one after the other.
+        starts: ``(R,)``, that of each row of all PSFs; each PSF has one more, where its last row ends.
+        points: of all PSFs; the first row of each has the number 0.
     """
 
     shape: Shape
@@ -36,22 +39,8 @@ class RadiusBank(NamedTuple):
     reach: int
     firsts: np.ndarray
     ends: np.ndarray
-    rows: PsfRows
-
-
-class PsfBuffer(NamedTuple):
-    """Room for ``n`` rows of one PSF of that shape; ``table (7, > n)`` is what `row_table` and `row_slopes` fill."""
-
-    shape: Shape
-    table: np.ndarray
-    rows: PsfRows
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def psf_buffer(shape, n):  # type: ignore[no-untyped-def]
-    """A `PsfBuffer` of ``n`` rows."""
-    rows = PsfRows(np.empty((n, 2), np.int64), np.empty((n, 4), np.float64), np.empty((n, 4), np.float64))
-    return PsfBuffer(shape, np.empty((7, n + 1), np.float64), rows)
+    starts: np.ndarray
+    points: PsfPoints
 
 
 @nb.njit(inline="always")
@@ -75,85 +64,66 @@ def rounded(coc):  # type: ignore[no-untyped-def]
     return math.copysign(radius_of(number_of(r)), coc) if r < ROUNDED_TO else coc
 
 
-@nb.njit(inline="always")
-def rows_within(first, begin, end, y0, y1):  # type: ignore[no-untyped-def]
-    """Of the rows ``begin .. end-1`` of a bank, the first of which lies in row ``first``, those in ``y0 .. y1-1``.
-
-    Returns the row of the first of them, and from which to which they are.
-    """
-    skipped = max(y0 - first, 0)
-    return first + skipped, (begin + skipped, begin + min(y1 - first, end - begin))
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def draw_psf(coc, x, first, n, borders, buffer):  # type: ignore[no-untyped-def]
-    """Draw a PSF of the radius ``coc``, its centre at column ``x``, in the rows ``first .. first+n-1`` from its centre.
-
-    ``coc`` is signed, and not 0. Ends are kept within the columns ``borders``, the lowest and the highest.
-    """
-    low, high = borders
-    rows, (columns, weights, _) = buffer.table, buffer.rows
-    row_table(coc, first, n, buffer.shape, rows)
-    for k in range(n):
-        left = min(max(x + rows[0, k], low), high)
-        right = min(max(x + rows[1, k], low), high)
-        w = rows[2, k]
-        i, j = math.floor(left), math.floor(right)
-        columns[k, 0], columns[k, 1] = i, j
-        weights[k, 0], weights[k, 1] = w * (1.0 - (left - i)), w * (left - i)
-        weights[k, 2], weights[k, 3] = -w * (1.0 - (right - j)), -w * (right - j)
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def draw_slopes(coc, x, first, n, borders, buffer):  # type: ignore[no-untyped-def]
-    """The slopes of the rows; after `draw_psf`, with the same arguments."""
-    low, high = borders
-    rows, slopes = buffer.table, buffer.rows.slopes
-    row_slopes(coc, first, n, buffer.shape, rows)
-    for k in range(n):
-        left, right, w = x + rows[0, k], x + rows[1, k], rows[2, k]
-        by_left = w * rows[4, k] if low < left < high else 0.0
-        by_right = w * rows[5, k] if low < right < high else 0.0
-        f = min(max(left, low), high)
-        f -= math.floor(f)
-        g = min(max(right, low), high)
-        g -= math.floor(g)
-        dw = rows[6, k]
-        slopes[k, 0], slopes[k, 1] = dw * (1.0 - f) - by_left, dw * f + by_left
-        slopes[k, 2], slopes[k, 3] = -dw * (1.0 - g) + by_right, -dw * g - by_right
-
-
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _draw_all(count, shape, sign, with_slopes):  # type: ignore[no-untyped-def]
     shapes, s = shape.tables, 1 if sign < 0.0 else 0
     ends, firsts = np.zeros(count + 1, np.int64), np.zeros(count, np.int64)
+    most = 0
     for k in range(count):
         r = radius_of(k)
         # A row that is only touched holds nothing: a PSF of half a pixel is one row.
-        firsts[k] = math.ceil(r * shapes[s, 0, 0] - 0.5 + 1e-9)
-        ends[k + 1] = ends[k] + math.floor(r * shapes[s, -1, 0] + 0.5 - 1e-9) - firsts[k] + 1
-    columns, weights = np.empty((ends[-1], 2), np.int64), np.empty((ends[-1], 4), np.float64)
-    slopes = np.zeros((ends[-1] if with_slopes else 0, 4), np.float64)
-    table = np.empty((7, int(2 * radius_of(count)) + 8), np.float64)
+        firsts[k] = 0 if shape.level else math.ceil(r * shapes[s, 0, 0] - 0.5 + 1e-9)
+        n = math.floor(r * shapes[s, -1, 0] + 0.5 - 1e-9) - firsts[k] + 1
+        ends[k + 1] = ends[k] + n + 1
+        most += (2 if shape.even else 4) * most_points(n, int(2 * r) + 2)
+    starts = np.empty(ends[-1], np.int64)
+    places, weights = np.empty((most, 4), np.int32), np.empty(most, np.float64)
+    slopes = np.zeros(most if with_slopes else 0, np.float64)
+    across = int(2 * radius_of(count)) + 8
+    buffer, borders, done = psf_buffer(across, across), (-1000000, 1000000), 0
+    room, arcs = psf_room(shape, buffer), (2 if shape.even else 0)
+    counts, points = np.empty(across + 1, np.int64), buffer.points
     for k in range(count):
-        coc = sign * radius_of(k)
-        a, b = ends[k], ends[k + 1]
-        first, n, borders = firsts[k], b - a, (-1e9, 1e9)
-        psf = PsfBuffer(shape, table, PsfRows(columns[a:b], weights[a:b], slopes[a:b]))
-        draw_psf(coc, 0.5, first, n, borders, psf)
-        if with_slopes and k > 0:
-            draw_slopes(coc, 0.5, first, n, borders, psf)
-    return firsts, ends, columns, weights, slopes
+        coc, n, sloping = sign * radius_of(k), ends[k + 1] - ends[k] - 1, with_slopes and k > 0
+        own = starts[ends[k] : ends[k + 1]]
+        own[:] = 0
+        at_rows(coc, (firsts[k], n), room)
+        for again in range(2):  # first only how many points each row has, then each in its place
+            if again:
+                total = done
+                for row in range(n + 1):
+                    own[row], total = total, total + own[row]
+                counts[:n] = 0
+            for arc in range(arcs, 4):
+                first, rows = draw_arc(arc, coc, (0, firsts[k], n), borders, room, sloping)
+                for row in range(rows):
+                    begin, end = buffer.starts[row], buffer.starts[row + 1]
+                    if not again:
+                        own[first + row] += end - begin
+                        continue
+                    at = own[first + row] + counts[first + row]
+                    counts[first + row] += end - begin
+                    for i in range(end - begin):
+                        places[at + i] = points.places[begin + i]
+                        places[at + i, 0] = first + row
+                        weights[at + i] = points.weights[begin + i]
+                        if sloping:
+                            slopes[at + i] = points.slopes[begin + i]
+        done = own[n]
+    return firsts, ends, starts, places[:done].copy(), weights[:done].copy(), slopes[:done].copy()
 
 
 def radius_bank(largest: float, shape: Shape, *, slopes: bool = False) -> RadiusBank:
     """Draw the PSFs of all radii up to ``largest``."""
     count = int(number_of(largest)) + 1
     symmetric = bool(np.abs(shape.tables[0, :, :3] - shape.tables[1, :, :3]).max() < 1e-14)
-    firsts, ends, *rows = _draw_all(count, shape, 1.0, slopes)
+    firsts, ends, starts, *points = _draw_all(count, shape, 1.0, slopes)
     if not symmetric:
-        behind, stops, *others = _draw_all(count, shape, -1.0, slopes)
-        firsts, ends = np.concatenate([firsts, behind]), np.concatenate([ends, stops[1:] + ends[-1]])
-        rows = [np.concatenate(pair) for pair in zip(rows, others, strict=True)]
+        others = _draw_all(count, shape, -1.0, slopes)
+        ends = np.concatenate([ends, others[1][1:] + ends[-1]])
+        firsts, starts = np.concatenate([firsts, others[0]]), np.concatenate([starts, others[2] + len(points[0])])
+        points = [np.concatenate(pair) for pair in zip(points, others[3:], strict=True)]
     reach = math.ceil(largest) + 2
-    return RadiusBank(shape, 0 if symmetric else count, reach, firsts, ends, PsfRows(*rows))
+    return RadiusBank(
+        shape, 0 if symmetric else count, reach, firsts, ends, starts, PsfPoints(*points, np.empty((0, 0)))
+    )

@@ -22,6 +22,7 @@ from torchbokeh.ops.merge import (
     EVEN,
     FADE,
     FEWEST,
+    LIT,
     MARGIN,
     ROUNDED_TO,
     SPREAD,
@@ -138,7 +139,8 @@ def test_shares_sum_to_one(coc: list[float], merging: Merging, highest: int, dou
     torch.testing.assert_close(sum(shares), torch.ones_like(radius), rtol=0, atol=1e-6)
     together = torch.stack(shares)
     assert together.min() >= 0
-    used = together > 0
+    assert int((together > 0).sum(0).max()) <= 3
+    used = torch.stack(level_shares(torch.ones_like(values), radius, merging, highest)) > 0
     assert int(used.sum(0).max()) <= 2
     # Where there are two, they are neighbours.
     assert torch.equal(used[:-1] & used[1:], used[:-1] & (used.cumsum(0)[-1] == 2) & (used.cumsum(0)[:-1] == 1))
@@ -176,7 +178,7 @@ def test_highlights_stay_on_the_lowest_level() -> None:
     # The mean rises with what is put in: channel by channel x / mean = bound.
     values[0, 1] = 0.0
     just = bound * (1e4 - 1) / (1e4 - bound)
-    for factor, level in ((0.999, 3), (1.001, 0), (1e6, 0)):
+    for factor, level in ((0.999 * LIT, 3), (1.001, 0), (1e6, 0)):
         for sign in (1, -1):
             values[0, 0, 50, 50] = sign * factor * just
             shares = torch.stack(level_shares(values, torch.full((1, 1, 100, 100), radius, dtype=F64), MIDDLE, 3))
@@ -190,9 +192,24 @@ def test_a_highlight_has_some_contrast_whatever_its_radius() -> None:
     values = torch.ones(1, 1, 100, 100, dtype=F64)
     coc = torch.full((1, 1, 100, 100), 2.0 * MIDDLE.cells * 1.2, dtype=F64)
     merging = Merging(MIDDLE.cells, 1e-9)
-    for value, share in ((0.99 * LEAST_CONTRAST, 1), (1.01 * LEAST_CONTRAST, 0)):
+    for value, share in ((0.99 * LIT * LEAST_CONTRAST, 1), (1.01 * LEAST_CONTRAST, 0)):
         values[0, 0, 3, 4] = value * (1e4 - 1) / (1e4 - value)
         assert float(level_shares(values, coc, merging, 1)[1][0, 0, 3, 4]) == share
+
+
+def test_a_light_that_grows_becomes_a_highlight_gradually() -> None:
+    coc, lowest = torch.full((1, 1, 100, 100), 40.0, dtype=F64), []
+    for value in torch.linspace(15, 30, 501, dtype=F64):
+        values = torch.ones(1, 1, 100, 100, dtype=F64)
+        values[..., 50, 50] = value
+        shares = torch.stack(level_shares(values, coc, MIDDLE, 3))[:, 0, 0, 50, 50]
+        assert float(shares.sum()) == pytest.approx(1)
+        assert float(shares[1:3].sum()) == 0
+        lowest.append(float(shares[0]))
+    assert lowest[0] == 0
+    assert lowest[-1] == 1
+    assert np.diff(lowest).min() >= 0
+    assert np.diff(lowest).max() < 0.01
 
 
 def test_a_highlight_is_bright_for_its_own_picture_and_channel() -> None:

@@ -16,7 +16,7 @@ from torchbokeh.ops import dispatch
 from torchbokeh.ops.dense import dense_spans
 from torchbokeh.ops.integrate import running_sum_x
 from torchbokeh.ops.merge import Merging, splat_merged
-from torchbokeh.ops.spans import Profile
+from torchbokeh.ops.spans import Profile, subdivide
 from torchbokeh.ops.splat import PointTable, splat_points, splat_spans
 from torchbokeh.psfs import Aperture, Disc, Ellipse, Polygon
 
@@ -117,6 +117,18 @@ def test_the_kernel_computes_what_the_torch_definition_does(channels: int, integ
     seed = torch.randn(got.shape, generator=torch.Generator().manual_seed(0))
     for mine, theirs in zip(gradients(got, seed, values, coc), gradients(want, seed, values, coc), strict=True):
         assert_close(mine, theirs, 1e-6)
+
+
+def test_a_part_of_a_lens_need_not_reach_its_centre() -> None:
+    values, coc = (t.requires_grad_() for t in scene(1, 3, 20, 30, reach=60.0))
+    for profile in subdivide(Disc().profile(), 3)[::4]:
+        got = splat_spans(values, coc, profile, integrate=True)
+        want = splat_spans(values.double(), coc.double(), profile, integrate=True)
+        assert_close(got, want, 1e-6)
+        assert_close(want, dense_spans(values, coc, profile), 1e-9)
+        seed = torch.randn(got.shape, generator=torch.Generator().manual_seed(0))
+        for mine, theirs in zip(gradients(got, seed, values, coc), gradients(want, seed, values, coc), strict=True):
+            assert_close(mine, theirs, 1e-6)
 
 
 def turned(blades: int) -> Any:

@@ -85,12 +85,26 @@ def test_the_pieces_tile_the_shape(shape: Aperture, side: int) -> None:
     pieces = subdivide(shape.profile(), side)
     rows = [pieces[k : k + side] for k in range(0, len(pieces), side)]
     for row in rows:
-        for one, other in pairwise(row):
-            assert torch.allclose(one.knots[:, [0, 2]], other.knots[:, [0, 1]])
+        for one, other in pairwise(row):  # a cut along a column: what reaches it goes on beyond it
+            assert torch.equal(one.knots[:, 0], other.knots[:, 0])
+            assert float(other.knots[:, 1].amin()) == pytest.approx(float(one.knots[:, 2].amax()), abs=1e-12)
+        widths = sum(piece.knots[:, 2] - piece.knots[:, 1] for piece in row)
+        left, right = edges_at(shape.profile(), row[0].knots[:, 0])
+        torch.testing.assert_close(widths, right - left, rtol=0, atol=1e-9)
     for lower, upper in pairwise(rows):
         assert float(lower[0].knots[-1, 0]) == pytest.approx(float(upper[0].knots[0, 0]), abs=1e-12)
     assert float(rows[0][0].knots[0, 0]) == pytest.approx(float(shape.profile().knots[0, 0]))
     assert float(rows[-1][0].knots[-1, 0]) == pytest.approx(float(shape.profile().knots[-1, 0]))
+
+
+@pytest.mark.parametrize("side", [2, 3, 5])
+def test_pieces_are_convex(shape: Aperture, side: int) -> None:
+    for piece in subdivide(shape.profile(), side):
+        y, left, right = piece.knots.T
+        filled = right - left > 1e-9  # where a row is empty, both edges lie on the cut
+        rise = y[filled].diff().clamp_min(1e-9)
+        assert ((left[filled].diff() / rise).diff() > -1e-5).all()
+        assert ((right[filled].diff() / rise).diff() < 1e-5).all()
 
 
 @pytest.mark.parametrize("side", [2, 3])

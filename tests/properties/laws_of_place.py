@@ -55,6 +55,12 @@ def even(scene: Scene) -> Scene | None:
     return promised(scene)
 
 
+def even_turned(scene: Scene) -> Scene | None:
+    """A lens is cut along rows first: one that is no disc is cut into other pieces when it is turned."""
+    found = even(scene)
+    return found if found is None or found.aperture == "disc" else replace(found, subapertures=1)
+
+
 def symmetric(scene: Scene) -> float:
     """1e-3, and where pixels are merged in blocks that begin at a corner, twice what the quality promises."""
     bank = scene.bank != "none" or scene.renderer == "reconstruct" or scene.motion != "none" or scene.approach
@@ -197,7 +203,7 @@ LAWS = (
         Law(
             name,
             f"A scene {name} makes the picture {name}, the aperture with it; relative L1.",
-            even,
+            even_turned if TURNS[name][2][0] == math.pi / 2 else even,
             symmetry(name),
             symmetric,
         )

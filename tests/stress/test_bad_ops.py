@@ -255,11 +255,15 @@ STEPS = {
     **dict.fromkeys(("flatten", "unflatten"), "steps of splat_points"),
     **dict.fromkeys(("edge_slopes", "heights_above", "piece_at"), "steps of splat_spans"),
     **dict.fromkeys(("coc_bounds", "window"), "steps of subsample_blur"),
-    **dict.fromkeys(("area", "clamp_radius", "edges_at", "knot_integrals", "row_span"), "steps of splat_spans"),
+    **dict.fromkeys(("area", "clamp_radius", "edge_integrals", "edges_at"), "steps of splat_spans"),
+    "knot_integrals": "a step of splat_spans",
+    **dict.fromkeys(("arcs_of", "crossings", "edge_at", "mean_edge", "row_pieces"), "steps of splat_spans"),
     "pixel_centres": "a step of render_planes",
     **dict.fromkeys(("check_centres", "check_profile"), "checks themselves"),
     "working_dtype": "asks for a device only",
-    **dict.fromkeys(("Merging", "NBuffers", "Placement", "Plates", "PointTable", "Profile"), "records"),
+    **dict.fromkeys(
+        ("Arcs", "Merging", "NBuffers", "Pieces", "Placement", "Plates", "PointTable", "Profile"), "records"
+    ),
 }
 
 
@@ -269,7 +273,7 @@ def test_each_bad_argument_is_named(name: str, one_by_one: Callable[[Any], list[
     assert not wrong, "\n".join(wrong)
 
 
-HELPERS = {"checks", "dispatch", "onnx_functions", "cie_1931", "span_gradient", "highlights"}
+HELPERS = {"checks", "dispatch", "onnx_functions", "onnx_outline", "cie_1931", "outline_gradient", "highlights"}
 """Modules that take no arguments of a caller's: checks themselves, which way is taken, tables, parts of an operator."""
 
 

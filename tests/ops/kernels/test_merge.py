@@ -389,11 +389,14 @@ def test_highlights_are_noted_and_rows_know_their_reach() -> None:
     shares = torch.stack(level_shares(values, coc, MIDDLE, highest))[:, 0, 0]
     levels = collected(values, coc, highest)
     merged_without = torch.stack(level_shares(torch.ones_like(values), coc, MIDDLE, highest))[:, 0, 0]
-    highlights = (shares[0] == 1) & (merged_without[0] < 1)
-    assert levels.marks.tolist() == highlights.flatten().nonzero()[:, 0].tolist()
-    assert len(levels.marks) > 5
+    lowest = merged_without[0]
+    lit = torch.where(lowest < 1, (shares[0] - lowest) / (1 - lowest), 0.0)
+    lit = torch.where(lit > 1e-6, lit, 0.0)
+    assert levels.marks.tolist() == lit.flatten().nonzero()[:, 0].tolist()
+    assert_close(torch.from_numpy(levels.lit), lit[lit > 0], 1e-5)
+    assert int((lit == 1).sum()) > 5
     for level in range(highest + 1):
-        used = torch.where((shares[level] > 0) & ~(highlights if level == 0 else highlights & False), radius, 0)
+        used = torch.where((merged_without[level] > 0) & (lit < 1), radius, 0)
         rows = F.pad(used, (0, 0, 0, -100 % 2**level)).reshape(-1, 2**level, 70).amax((1, 2))
         assert levels.reach[level, : len(rows)].tolist() == rows.tolist()
     # A row of which nothing is on the lowest level.
@@ -526,7 +529,7 @@ def test_the_bank_stays_small_where_nothing_is_to_be_merged() -> None:
     values, coc = scene(1, 3, 60, 50, 40.0)
     huge = MIDDLE._replace(cells=1000.0)
     bank = bank_for(Disc().profile(), huge, slopes=True)
-    assert sum(t.nbytes for t in (bank.firsts, bank.ends, *bank.rows)) < 2**25
+    assert sum(t.nbytes for t in (bank.firsts, bank.ends, *bank.points)) < 2**25
     got, want = (
         splat_merged(v, c, Disc().profile(), huge) for v, c in ((values, coc), (values.double(), coc.double()))
     )

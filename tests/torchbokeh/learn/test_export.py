@@ -96,7 +96,7 @@ def test_operators_are_standard_ones(exported):
     nodes = [*model.graph.node, *(node for function in model.functions for node in function.node)]
     assert all(node.domain == "" or node.op_type in own for node in nodes)
     assert not {"DFT", "RFFT"} & {node.op_type for node in nodes}
-    assert exported[3].stat().st_size < 400_000
+    assert exported[3].stat().st_size < 500_000  # outlines, cut at rows and columns, are a part of it
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ DENSE = "autograd, dense"
 
 # Bytes that a graph keeps: for each row interval of a pixel, for each pixel and offset, for each pixel and bin of a
 # sub-aperture, and for each pixel besides.
-_INTERVAL, _OFFSET, _BIN, _PIXEL = 500, 8, 85, 300
+_INTERVAL, _OFFSET, _BIN, _PIXEL = 1900, 8, 85, 300
 
 
 def gradient_methods() -> dict[str, Method]:

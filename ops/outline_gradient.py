@@ -1,70 +1,72 @@
-"""The gradient of `row_span` by hand: within an operator torch records no graph that could be followed back."""
+"""The gradient of `mean_edge` by hand: within an operator torch records no graph that could be followed back."""
 
 import math
 
 import torch
 from torch import Tensor
 
+from torchbokeh.ops.outline import LEAST, Pieces
 from torchbokeh.ops.spans import FLAT, Profile, area, edge_slopes, knot_integrals, piece_at
 
 
-def row_span_gradient(
-    coc: Tensor, row: int, profile: Profile, by_left: Tensor, by_right: Tensor, by_weight: Tensor
+def mean_edge_gradient(
+    coc: Tensor, pieces: Pieces, profile: Profile, by_mean: Tensor, by_weight: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pull gradients of the outputs of `row_span` back to its inputs.
+    """Pull gradients of the outputs of `mean_edge` back to its inputs.
+
+    Where an outline is cut, pieces meet, and what one loses the other gains: cuts stay where they are in px. Only the
+    ends of the shape move with it.
 
     Args:
-        coc: ``(N,)`` as for `row_span`.
-        row: as for `row_span`.
-        profile: as for `row_span`.
-        by_left: ``(N,)`` gradient of the left ends.
-        by_right: ``(N,)`` gradient of the right ends.
-        by_weight: ``(N,)`` gradient of the weights.
+        coc: ``(M,)`` as for `mean_edge`.
+        pieces: as for `mean_edge`.
+        profile: as for `mean_edge`.
+        by_mean: ``(M,)`` gradient of the mean places.
+        by_weight: ``(M,)`` gradient of the weights.
 
     Returns:
-        Gradients of ``coc (N,)``, ``profile.knots (K, 3)`` and ``profile.bulge ()``.
+        Gradients of ``coc (M,)``, ``profile.knots (K, 3)`` and ``profile.bulge ()``.
     """
     knots, bulge = profile
     bottom, top = knots[0, 0], knots[-1, 0]
     half, middle = 0.5 * (top - bottom), 0.5 * (top + bottom)
-    ends = (row + torch.tensor([[-0.5], [0.5]], dtype=coc.dtype, device=coc.device)) / coc
-    ends = ends.sort(0).values  # the lower and the upper end of the row, (2, N)
+    ends = torch.stack([pieces.low, pieces.high])
     inner = (ends > bottom) & (ends < top)
-    clamped = ends.clamp(bottom, top)
-    height = clamped[1] - clamped[0]
-    covered = height > 1e-12
+    height = pieces.high - pieces.low
+    covered = height > LEAST
     safe = torch.where(covered, height, 1.0)
+    left = (pieces.arc < 2)[:, None]
+    chosen = torch.cat([left, ~left], 1).to(coc.dtype)
+    side = torch.where(left[:, 0], -1.0, 1.0).to(coc.dtype)
 
-    # At both ends: the edges (2, N, 2), their integrals, the semicircle and its integral.
-    slopes, k = edge_slopes(knots), piece_at(knots, clamped)
-    dy = (clamped - knots[k, 0])[..., None]
+    # At both ends: the edges (2, M, 2), their integrals, the semicircle and its integral.
+    slopes, k = edge_slopes(knots), piece_at(knots, ends)
+    dy = (ends - knots[k, 0])[..., None]
     edges = knots[k, 1:] + slopes[k] * dy
     integrals = knot_integrals(knots)[k] + dy * (knots[k, 1:] + 0.5 * slopes[k] * dy)
-    t = (clamped - middle) / half
+    t = (ends - middle) / half
     circle = (1 - t * t).clamp_min(0).sqrt()
     arcs = 0.5 * (t * circle + torch.atan2(t, circle))
 
-    mean = (integrals[1] - integrals[0]) / safe[:, None]
+    mean = ((integrals[1] - integrals[0]) * chosen).sum(1) / safe
     arc = half * (arcs[1] - arcs[0]) / safe
-    side = torch.tensor([-1.0, 1.0], dtype=coc.dtype, device=coc.device)
     unit_area = area(profile)
 
-    # From the outputs to what they are made of. `edge = coc * (mean -+ bulge * arc)`, `weight = height / |coc| / area`.
-    by_edge = torch.stack([by_left, by_right], 1)
-    by_edge = torch.where(covered[:, None], torch.where(coc[:, None] < 0, by_edge.flip(1), by_edge), 0.0)
+    # From the outputs to what they are made of: `coc * (mean -+ bulge * arc)` and `height / |coc| / area`.
+    by_mean = torch.where(covered, by_mean, 0.0)
     by_weight = torch.where(covered, by_weight, 0.0)
     per_height = 1 / (coc.abs() * unit_area)
-    by_coc = (by_edge * (mean + side * (bulge * arc)[:, None])).sum(1) - by_weight * per_height * height / coc
-    by_mean = by_edge * coc[:, None]
-    by_round = (by_mean * side).sum(1)
+    by_coc = by_mean * (mean + side * bulge * arc) - by_weight * per_height * height / coc
+    by_mean = by_mean * coc
+    by_round = side * by_mean
     by_arc = bulge * by_round
-    by_height = by_weight * per_height - ((by_mean * mean).sum(1) + by_arc * arc) / safe
+    by_height = by_weight * per_height - (by_mean * mean + by_arc * arc) / safe
     by_area = -(by_weight * per_height * height).sum() / unit_area
     by_bulge = (by_round * arc).sum() + by_area * math.pi * half
 
-    # To the ends of the row, and through them to the CoC or, where they are cut off, to the end of the shape.
+    # To the ends of the pieces, and through them to the CoC or, where the shape ends, to that.
     sign = torch.tensor([[-1.0], [1.0]], dtype=coc.dtype, device=coc.device)
-    by_integral = sign[..., None] * by_mean / safe[:, None]
+    by_integral = sign[..., None] * (by_mean / safe)[:, None] * chosen
     by_semicircle = sign * by_arc / safe
     by_ends = sign * by_height + (by_integral * edges).sum(2) + by_semicircle * circle
     by_coc = by_coc - (by_ends * inner * ends).sum(0) / coc
@@ -73,7 +75,8 @@ def row_span_gradient(
     by_bottom = (by_ends * (ends <= bottom)).sum() + 0.5 * (by_middle - by_half)
     by_top = (by_ends * (ends >= top)).sum() + 0.5 * (by_middle + by_half)
 
-    by_knots = _knots_gradient(knots, (k, dy, edges), by_integral, by_area * side)
+    sides = torch.tensor([-1.0, 1.0], dtype=coc.dtype, device=coc.device)
+    by_knots = _knots_gradient(knots, (k, dy, edges), by_integral, by_area * sides)
     by_knots[0, 0] += by_bottom
     by_knots[-1, 0] += by_top
     return by_coc, by_knots, by_bulge
