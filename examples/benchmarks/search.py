@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=0, help="another one tries other scenes")
     parser.add_argument("--laws", nargs="*", default=[], help="names, or parts of them; all without it")
+    parser.add_argument("--largest", type=int, default=130, metavar="PX", help="no side is longer")
     parser.add_argument("--tiny", action="store_true", help="two small scenes of each law, to see that it runs")
     args = parser.parse_args()
     law, laws, scenes = package()
@@ -46,7 +47,7 @@ def main() -> None:
 
     torch.set_num_threads(1)  # scenes are small
     rng, worst, counts = np.random.default_rng(args.seed), {}, {one.name: [0, 0, 0.0] for one in chosen}
-    sides = scenes.SIDES[:8] if args.tiny else scenes.LARGE
+    sides = scenes.SIDES[:8] if args.tiny else tuple(n for n in scenes.LARGE if n <= max(args.largest, 1))
     start = time.monotonic()
     while time.monotonic() - start < (0 if args.tiny else 60 * args.minutes) or min(c[0] for c in counts.values()) < 2:
         # Each law gets about the same time, so that a slow one does not hold up the others.

@@ -164,7 +164,8 @@ class Plan(Look):
         elif self.subapertures > 1:
             lines.append(f"{self.aperture}, cut into {self.subapertures} x {self.subapertures} sub-apertures.")
         else:
-            lines.append(f"{self.aperture}, whole: nothing hides anything, or the blur is too small to show it.")
+            small = "the blur is too small for sub-apertures to show, or the quality has none"
+            lines.append(f"{self.aperture}, whole: {'nothing hides anything' if self.hidden == 'nothing' else small}.")
         if self.highest:
             lines.append(
                 f"Quality {self.quality.name!r}: blocks of up to {2**self.highest} x {2**self.highest} pixels are "
