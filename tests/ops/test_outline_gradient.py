@@ -30,4 +30,4 @@ def test_equals_the_gradient_that_autograd_finds(shape: Aperture, row: int) -> N
     want = torch.autograd.grad(out, (owned, *profile), grads)
     got = mean_edge_gradient(owned.detach(), pieces, Profile(*(t.detach() for t in profile)), *grads)
     for mine, theirs in zip(got, want, strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-8)
+        torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-9)
