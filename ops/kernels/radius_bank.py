@@ -124,6 +124,6 @@ def radius_bank(largest: float, shape: Shape, *, slopes: bool = False) -> Radius
         firsts, starts = np.concatenate([firsts, others[0]]), np.concatenate([starts, others[2] + len(points[0])])
         points = [np.concatenate(pair) for pair in zip(points, others[3:], strict=True)]
     reach = math.ceil(largest) + 2
-    return RadiusBank(
-        shape, 0 if symmetric else count, reach, firsts, ends, starts, PsfPoints(*points, np.empty((0, 0)))
-    )
+    places, weights, changes = points
+    every = PsfPoints(places, weights, changes, scratch=np.empty((0, 0)))
+    return RadiusBank(shape, 0 if symmetric else count, reach, firsts, ends, starts, every)

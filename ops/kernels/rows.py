@@ -12,6 +12,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.types.containers import UniTuple
+from numba.core.types.misc import CPointer
 from numba.extending import intrinsic
 
 _D4 = ir.VectorType(ir.DoubleType(), 4)
@@ -182,7 +183,7 @@ def pointer(typingctx, array):  # type: ignore[no-untyped-def]
     def build(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return _data(context, builder, sig.args[0], args[0])
 
-    return types.CPointer(array.dtype)(array), build
+    return CPointer(array.dtype)(array), build
 
 
 @nb.njit(inline="always")

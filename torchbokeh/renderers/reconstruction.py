@@ -68,12 +68,11 @@ def _of_one(samples: Samples, bank: PsfBank, layers: int) -> Tensor:
     coc, (height, width) = samples.coc.detach(), samples.coc.shape[3:]
     largest, farthest = float(coc.abs().max()), float(samples.motion.detach().norm(dim=2).max())
     lit = passed(lights_at_border(samples.colour[0], coc[0], largest, farthest), BRIGHTER)
-    plain = _mean_of(samples, bank, layers) if lit < 1 else 0.0
     if not lit:
-        return plain
+        return _mean_of(samples, bank, layers)
     around = Surrounding(min(math.ceil(largest + farthest), min(height, width) // 2))
     whole = around.cut(_mean_of(around.of_samples(samples), bank, layers))
-    return lit * whole + (1 - lit) * plain
+    return whole if lit == 1 else lit * whole + (1 - lit) * _mean_of(samples, bank, layers)
 
 
 def _mean_of(samples: Samples, bank: PsfBank, layers: int) -> Tensor:
