@@ -29,7 +29,9 @@ SMALL = """
 import sys
 from functools import partial
 sys.argv[0] = "torchbokeh"
-from torchbokeh.commands.main import main
+from torchbokeh.commands.entry import main
+from torchbokeh.commands.signals import end_while_importing
+end_while_importing()  # as `main` does, for the two that follow are long to import on a busy machine
 from torchbokeh.psfs import SimpleLens
 from torchbokeh.psfs.models import MODELS
 MODELS["simple-lens"] = partial(SimpleLens, radius=3.0)
