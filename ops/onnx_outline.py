@@ -14,6 +14,18 @@ DOMAIN = Opset("torchbokeh", 1)
 
 
 @script(DOMAIN)
+def piece_of(ends: DOUBLE["N"], heights: DOUBLE["K"], strides: INT64["T"]) -> INT64["N"]:
+    """The piece of an outline that each of the heights ``ends`` lies in: knots are found by halving, two need none."""
+    last = op.Size(heights) - 2
+    found = op.Cast(op.CastLike(0.0, ends) * ends, to=INT64.dtype)
+    halvings = op.Size(strides)
+    for step in range(halvings):
+        further = op.Min(found + op.Gather(strides, step), last)
+        found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
+    return found
+
+
+@script(DOMAIN)
 def edge_integrals(
     ends: DOUBLE["N"],
     knots: DOUBLE["K", 3],
@@ -21,14 +33,9 @@ def edge_integrals(
     slopes: DOUBLE["S", 2],
     strides: INT64["T"],
 ) -> DOUBLE["N", 2]:
-    """Integrals of the left and right edge up to the heights ``ends``; knots are found by halving, two need none."""
+    """Integrals of the left and right edge up to the heights ``ends``."""
     heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
-    last = op.Size(heights) - 2
-    found = op.Cast(op.CastLike(0.0, ends) * ends, to=INT64.dtype)
-    halvings = op.Size(strides)
-    for step in range(halvings):
-        further = op.Min(found + op.Gather(strides, step), last)
-        found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
+    found = piece_of(ends, heights, strides)
     beyond = op.Unsqueeze(ends - op.Gather(heights, found), [1])
     edges = op.Slice(knots, [1], [3], [1])
     edge = op.Gather(edges, found) + op.CastLike(0.5, ends) * op.Gather(slopes, found) * beyond
@@ -66,12 +73,7 @@ def edges_at(
     one = op.CastLike(1.0, ends)
     two = op.CastLike(2.0, ends)
     heights = op.Squeeze(op.Slice(knots, [0], [1], [1]), [1])
-    last = op.Size(heights) - 2
-    found = op.Cast(zero * ends, to=INT64.dtype)
-    halvings = op.Size(strides)
-    for step in range(halvings):
-        further = op.Min(found + op.Gather(strides, step), last)
-        found = op.Where(op.GreaterOrEqual(ends, op.Gather(heights, further)), further, found)
+    found = piece_of(ends, heights, strides)
     right = op.GreaterOrEqual(arc, op.Constant(value_int=2))
     side = op.Cast(right, to=INT64.dtype)
     pair = op.Unsqueeze(found * 2 + side, [1])
@@ -270,5 +272,5 @@ def mean_edges(
     return mean, weight
 
 
-FUNCTIONS = (edge_integrals, arc_integral, edges_at, side_arcs, crossings, row_pieces, mean_edges)
+FUNCTIONS = (piece_of, edge_integrals, arc_integral, edges_at, side_arcs, crossings, row_pieces, mean_edges)
 """Each calls only those before it."""
