@@ -78,6 +78,8 @@ def arcs_of(profile: Profile) -> Arcs:
         extreme = middle - half * tilt / (tilt.square() + bulge.square()).sqrt().clamp_min(LEAST)
         extreme = torch.minimum(torch.maximum(extreme, knots[:-1, 0]), knots[1:, 0])
         turn = extreme[_turned(edge_at(Profile(knots, bulge), arc, extreme), arc).argmin()]
+        # What is no higher than rounding is left out: the other arc then has to begin where the shape does.
+        turn = torch.where(turn - bottom > LEAST, torch.where(top - turn > LEAST, turn, top), bottom)
         ends += [torch.stack([bottom, turn]), torch.stack([turn, top])]
         # The pieces just below and just above it.
         below = torch.searchsorted(knots[:, 0].contiguous(), turn) - 1
@@ -149,7 +151,9 @@ def row_pieces(coc: Tensor, x: Tensor, row: int, profile: Profile, arcs: Arcs, w
     column = first[of] + step * number
     entered = column + (step < 0)
     cut = crossings(profile, arcs, arc[of], (entered - centre[of]) / radius[of])
-    start = torch.where(number == 0, low[of], torch.minimum(torch.maximum(cut, low[of]), high[of]))
+    # As in `arcs_of`: what is left out is the beginning or the end of the piece beside it.
+    cut = torch.where(cut - low[of] > LEAST, torch.where(high[of] - cut > LEAST, cut, high[of]), low[of])
+    start = torch.where(number == 0, low[of], cut)
     stop = torch.where(number == count[of] - 1, high[of], start.roll(-1))
     return Pieces(owner[of], arc[of], start, stop, column)
 

@@ -27,6 +27,13 @@ SHAPES = {
     "hexagon": Polygon(6, 0.3),
     "round blades": Polygon(5, 0.4, 0.7),
 }
+PIECES = {
+    "triangle": Polygon(3, 1.0),
+    "square": Polygon(4, math.pi / 4),
+    "pentagon": Polygon(5, 0.3, 0.5),
+    "hexagon": Polygon(6),
+    "ellipse": Ellipse(2.0, 0.4),
+}
 few = settings(deadline=None, max_examples=15)
 
 
@@ -160,6 +167,35 @@ def test_gradients_match_finite_differences(build: Any, settings: list[float], i
         return splat_spans(values, coc, build(*settings), integrate=integrate)
 
     assert torch.autograd.gradcheck(blur, [t.requires_grad_() for t in inputs])
+
+
+@pytest.mark.parametrize("side", [1, 2, 3])
+@pytest.mark.parametrize("name", ["triangle", "square", "pentagon", "hexagon", "ellipse"])
+def test_the_gradient_of_a_piece_of_a_lens_matches_finite_differences(name: str, side: int) -> None:
+    """Where edges are level or upright, outlines have pieces of a height of rounding: they must not take the end of the
+    shape with them, which moves with the radius."""
+    seed, step = torch.Generator().manual_seed(0), 1e-6
+    values, by_out, way = (torch.randn(1, 1, 9, 9, dtype=F64, generator=seed) for _ in range(3))
+    coc = torch.empty(1, 1, 9, 9, dtype=F64).uniform_(0.7, 6.7, generator=seed)
+    for piece in subdivide(PIECES[name].profile(), side):
+        asked = coc.clone().requires_grad_()
+        (splat_spans(values, asked, piece, integrate=True) * by_out).sum().backward()
+        ahead, behind = (splat_spans(values, coc + s * way, piece, integrate=True) for s in (step, -step))
+        want = float(((ahead - behind) * by_out).sum()) / (2 * step)
+        assert float((asked.grad * way).sum()) == pytest.approx(want, rel=1e-6, abs=1e-6)
+
+
+def test_the_gradient_holds_up_to_where_an_edge_leaves_a_pixel() -> None:
+    """An almost level edge of a square comes to the border of a row at a radius of 6.36396."""
+    piece = subdivide(Polygon(4, 0.7853981).profile(), 3)[2]
+    values, by_out = torch.zeros(1, 1, 25, 25, dtype=F64), scene(1, 1, 25, 25, F64)[0]
+    values[..., 12, 12] = 1
+    slopes = []
+    for radius in (6.3637, 6.3638, 6.36385, 6.3639):
+        coc = torch.full_like(values, radius).requires_grad_()
+        (splat_spans(values, coc, piece, integrate=True) * by_out).sum().backward()
+        slopes.append(float(coc.grad.sum()))
+    assert max(slopes) - min(slopes) < 1e-3
 
 
 def test_a_trained_aperture_gets_its_gradient_in_float32() -> None:
