@@ -94,7 +94,8 @@ def _scaled(scene: Scene) -> dict[str, Callable[[Inputs, float], Inputs]]:
     if scene.background == "both":
         ways["background"] = lambda i, s: i._replace(behind=(i.behind[0], i.behind[1] * s))  # type: ignore[index,operator]
     if scene.layers:
-        ways["alpha"] = lambda i, s: i._replace(image=i.image * (0.01 + 0.99 * s))
+        # Not from nothing: changes are measured against what is there.
+        ways["alpha"] = lambda i, s: i._replace(image=i.image * (0.1 + 0.9 * s))
     if scene.renderer == "LensBlur" and scene.radius > 1:
         ways["max_coc"] = lambda i, s: i
     return ways

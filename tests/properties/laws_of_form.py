@@ -72,7 +72,8 @@ def with_background(scene: Scene) -> float:
 
 
 def behind_all(scene: Scene) -> Scene | None:
-    if scene.renderer != "LensBlur":
+    """Of one colour: with dispersion, what is behind the focus plane in one lies before it in another."""
+    if scene.renderer != "LensBlur" or scene.lens in ("rgb", "continuous"):
         return None
     return replace(nothing_hides(scene), background="both" if scene.seed % 2 else "image")
 

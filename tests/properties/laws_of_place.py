@@ -56,9 +56,11 @@ def even(scene: Scene) -> Scene | None:
 
 
 def even_turned(scene: Scene) -> Scene | None:
-    """A lens is cut along rows first: one that is no disc is cut into other pieces when it is turned."""
+    """A lens is cut along rows first: when it is turned, its pieces are others, but for quarters of a disc."""
     found = even(scene)
-    return found if found is None or found.aperture == "disc" else replace(found, subapertures=1)
+    if found is None:
+        return None
+    return replace(found, subapertures=min(found.subapertures or 2, 2) if found.aperture == "disc" else 1)
 
 
 def symmetric(scene: Scene) -> float:
@@ -87,8 +89,8 @@ def movable(scene: Scene) -> Scene | None:
     """A blur that is small beside the picture, of one surface; it is not of highlights, which change what is usual."""
     if scene.renderer in ("AccumulationBuffer", "ChromaticAccumulation") or scene.lens in ("rgb", "continuous"):
         return None
-    if scene.image in ("range", "spikes", "lognormal") or scene.bank == "volume":
-        return None
+    if scene.image in ("range", "spikes", "lognormal") or scene.bank in ("volume", "physical-lens"):
+        return None  # the PSFs of a lens of glass depend on the place
     coc = "steps" if scene.coc in WILD else scene.coc
     one = replace(scene, layers=0, side="behind", coc=coc, radius=min(scene.radius, 5.0), speed=min(scene.speed, 5.0))
     one = replace(one, background="none", approach=0.0, motion="pan" if scene.motion != "none" else "none")

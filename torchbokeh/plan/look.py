@@ -119,8 +119,9 @@ def _look_at_motion(image: Tensor, motion: Motion) -> tuple[float, tuple[float, 
     if not motion:
         return 0.0, None, 0.0
     found, ends = motion.displacements, motion.shutter_coc
-    work = working_dtype(image.device)  # in half precision the square of 300 px is infinite already
-    numbers = [image.new_zeros(1) if ends is None else ends.diff(dim=-3).abs().max()[None]]
+    # In half precision the square of 300 px is infinite already, and differences are rounded.
+    work = working_dtype(image.device)
+    numbers = [image.new_zeros(1) if ends is None else ends.to(work).diff(dim=-3).abs().max()[None]]
     if found:
         length = torch.stack([d.to(work).square().sum(-3) for d in found]).sqrt().sum(0).max()
         numbers += [length[None], *found[0].movedim(-3, 0).flatten(1).aminmax(dim=1)]

@@ -90,8 +90,9 @@ def accumulate_layers(
         moved = [None] * b if motion is None else motion.split(1)
         each = zip(layers.split(1), coc.split(1), moved, strict=True)
         return torch.cat([accumulate_layers(*one, views, prism, settings) for one in each])
-    largest = float(torch.where(layers[:, :, 3:] > 0, coc, 0.0).detach().abs().max())
-    farthest = 0.0 if motion is None else float(motion.detach().norm(dim=2).max())
+    there = layers[:, :, 3:].detach() > 0
+    largest = float(torch.where(there, coc, 0.0).detach().abs().max())
+    farthest = 0.0 if motion is None else float(torch.where(there, motion, 0.0).detach().norm(dim=2).max())
     lit = passed(lights_at_border(layers.detach(), coc.detach(), largest, farthest), BRIGHTER)
     if not lit:
         return _accumulated(layers, coc, motion, views, prism, settings)
