@@ -172,12 +172,13 @@ def slope_error(scene: Scene) -> float:
 
 
 def smooth(scene: Scene) -> Scene | None:
-    """Exact, and small; without choices: samples of banks, and layers that are just there."""
+    """Exact, and small; without choices: samples of banks, layers that are just there, and bins of even blur, which are
+    full to rounding: one pixel of more or of less blur is then a kink."""
     if scene.bank != "none" or scene.renderer == "reconstruct" or scene.lens in ("rgb", "continuous"):
         return None
     one = replace(still(scene), quality="exact", tolerance=None, batch=1, layers=min(scene.layers, 2))
     size = tuple(min(max(n, 3), 9) for n in one.size)
-    coc = one.coc if one.coc in ("ramp", "planes", "noise", "lognormal") else "ramp"
+    coc = one.coc if one.coc in ("ramp", "noise", "lognormal") else "ramp"
     return replace(one, size=size, coc=coc, radius=min(max(one.radius, 1.0), 6.0), image="noise", alpha="soft")
 
 

@@ -123,8 +123,8 @@ def in_half(scene: Scene) -> float:
 
 
 def halved(scene: Scene) -> Scene | None:
-    if scene.lens != "none" or scene.renderer == "reconstruct":
-        return None  # half precision has no room for positions in a picture
+    if scene.lens != "none" or scene.bank == "volume" or scene.renderer == "reconstruct":
+        return None  # half precision has no room for positions in a picture, and depths are made of radii here
     coc = "ramp" if scene.coc == "huge" else scene.coc  # infinite in half precision
     return replace(scene, coc=coc, image="noise" if scene.image in ("range", "spikes", "lognormal") else scene.image)
 

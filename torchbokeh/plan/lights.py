@@ -38,7 +38,7 @@ def lights_at_border(image: Tensor, coc: Tensor, largest: float, moved: float = 
     item, row, column = (contrast > LEAST_CONTRAST).nonzero(as_tuple=True)
     if not len(item):
         return 0.0
-    radius = coc.reshape(contrast.shape)[item, row, column].abs()
+    radius = coc.reshape(contrast.shape)[item, row, column].to(light.dtype).abs()
     bound = (SHOWN * radius.square()).clamp_min(LEAST_CONTRAST)
     height, width = image.shape[-2:]
     away = torch.stack([row, height - 1 - row, column, width - 1 - column]).amin(0) + 0.5
